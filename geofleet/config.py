@@ -1,0 +1,228 @@
+"""One frozen tree of settings, read from TOML.
+
+A scenario is a TOML file with the sections below; it starts from another one (`base`, `paper` unless it says
+otherwise) and overrides what it names. Every default lives in `scenarios/paper.toml` and nowhere else. Key names are
+unique over all sections, so `--set tracker=kalman` needs no section.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from geofleet.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Rate = Annotated[float, Field(ge=0, le=1)]
+ROOT_SCENARIO = "paper"
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class SceneConfig(_Section):
+    """Which signs a study simulates and scores."""
+
+    corridor_m: Positive
+    groups: tuple[str, ...]
+
+
+class FleetConfig(_Section):
+    """How vehicles follow the drive."""
+
+    frame_spacing_m: Positive
+    speed_mps: Positive
+    lateral_sigma_m: NonNegative
+    lateral_correlation_m: Positive
+    speed_factor_sigma: NonNegative
+
+
+class SensorConfig(_Section):
+    """What a camera sees and how wrong it is (paper, "Detection Simulation")."""
+
+    sensor_kind: str
+    range_m: Positive
+    fov_deg: Annotated[float, Field(gt=0, le=360)]
+    gnss_sigma_m: NonNegative
+    heading_sigma_deg: NonNegative
+    range_bias_sigma_m: NonNegative
+    bearing_bias_sigma_deg: NonNegative
+    range_noise_sigma_m: NonNegative
+    bearing_noise_sigma_deg: NonNegative
+    false_negative_rate: Rate
+    semantic_rate: Rate
+    semantic_draw: Literal["track", "frame"]
+    ghost_rate_per_ha: NonNegative
+
+
+class TrackingConfig(_Section):
+    """How a vehicle turns frames into tracks (paper, "Temporal Tracking and Fusion")."""
+
+    tracker: Literal["paper", "ideal"]
+    track_gate_m: Positive
+    track_reference: Literal["last", "mean"]
+    max_missed_frames: Annotated[int, Field(ge=0)]
+    min_track_frames: Annotated[int, Field(ge=1)]
+    end_on_leaving_view: bool
+
+
+class AggregateConfig(_Section):
+    """How detections of many passes become signs."""
+
+    method: Literal["dbscan"]
+    semantic: Literal["first", "after"]
+    eps_m: Positive
+    min_samples: Annotated[int, Field(ge=1)]
+    min_support: Annotated[int, Field(ge=1)]
+    min_support_share: Rate
+    tile_zoom: Annotated[int, Field(ge=12, le=20)]
+
+
+class EvaluateConfig(_Section):
+    """How a map is scored."""
+
+    gate_m: Positive
+    match_on: Literal["class", "concept", "none"]
+
+
+class Config(_Section):
+    """Everything that shapes a study."""
+
+    scenario: str
+    scene: SceneConfig
+    fleet: FleetConfig
+    sensor: SensorConfig
+    tracking: TrackingConfig
+    aggregate: AggregateConfig
+    evaluate: EvaluateConfig
+
+    def digest(self, *sections: str) -> str:
+        """Return 16 hex digits of the SHA-256 of some sections (all by default): what shapes a run or a step."""
+        text = self.model_dump_json(include=set(sections) or None)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+SECTIONS: dict[str, type[_Section]] = {
+    name: field.annotation
+    for name, field in Config.model_fields.items()
+    if isinstance(field.annotation, type) and issubclass(field.annotation, _Section)
+}
+_SECTION_OF = {key: name for name, section in SECTIONS.items() for key in section.model_fields}
+
+
+def packaged_scenarios() -> dict[str, Path]:
+    """Return the TOML file of every packaged scenario by name."""
+    folder = Path(str(resources.files("geofleet.scenarios")))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def load_config(
+    scenario: str | Path = ROOT_SCENARIO, overrides: Mapping[str, Any] | Iterable[str] = ()
+) -> Config:
+    """Read a scenario and apply overrides.
+
+    Parameters
+    ----------
+    scenario
+        Name of a packaged scenario, or path of a TOML file.
+    overrides
+        Key to value, or `key=value` texts; a key may be written with its section (`sensor.range_m`) or without.
+
+    Raises
+    ------
+    ConfigError
+        The scenario, a section or a key is unknown, or a value is out of range.
+    """
+    path = _find(scenario)
+    tree = _read(path, seen=())
+    pairs = (
+        overrides.items()
+        if hasattr(overrides, "items")
+        else (_split_override(text) for text in overrides)
+    )
+    for key, value in pairs:
+        section, name = _locate(key, where="--set")
+        tree[section][name] = value
+    try:
+        return Config.model_validate({"scenario": path.stem, **tree})
+    except ValidationError as error:
+        raise ConfigError(*_explain(error, path)) from None
+
+
+def _find(scenario: str | Path) -> Path:
+    packaged = packaged_scenarios()
+    if str(scenario) in packaged:
+        return packaged[str(scenario)]
+    path = Path(scenario)
+    if path.suffix == ".toml" and path.is_file():
+        return path
+    raise ConfigError(
+        f"unknown scenario {str(scenario)!r}.",
+        todo=f"Give one of {', '.join(packaged)}, or the path of a .toml file that exists.",
+    )
+
+
+def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, dict[str, Any]]:
+    """Read a TOML file over its base; unknown sections and keys are refused with their file."""
+    if path in seen:
+        raise ConfigError(f"scenarios start from each other: {' -> '.join(p.stem for p in (*seen, path))}.")
+    try:
+        own = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"not valid TOML: {error}.", where=str(path), todo="Mend the file.") from None
+    base = own.pop("base", None if path == packaged_scenarios()[ROOT_SCENARIO] else ROOT_SCENARIO)
+    tree: dict[str, dict[str, Any]] = (
+        _read(_find(base), (*seen, path)) if base else {name: {} for name in SECTIONS}
+    )
+    for section, keys in own.items():
+        if section not in SECTIONS or not isinstance(keys, dict):
+            raise ConfigError(
+                f"unknown section or key {section!r}.",
+                where=str(path),
+                todo=f"Sections are {', '.join(SECTIONS)}; keys stand inside them.",
+            )
+        for key, value in keys.items():
+            _locate(f"{section}.{key}", where=str(path))
+            tree[section][key] = value
+    return tree
+
+
+def _locate(key: str, where: str) -> tuple[str, str]:
+    """Return section and name of a key given with or without its section."""
+    section, _, name = key.rpartition(".")
+    section = section or _SECTION_OF.get(name, "")
+    if section in SECTIONS and name in SECTIONS[section].model_fields:
+        return section, name
+    near = difflib.get_close_matches(name, _SECTION_OF, n=3)
+    hint = f"Did you mean {' or '.join(near)}?" if near else "`geofleet schema config` lists the keys."
+    raise ConfigError(f"unknown scenario key {key!r}.", where=where, todo=hint)
+
+
+def _split_override(text: str) -> tuple[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError(f"{text!r} is not key=value.", where="--set", todo="Example: --set eps_m=4.0")
+    try:
+        return key.strip(), tomllib.loads(f"v = {value}")["v"]
+    except tomllib.TOMLDecodeError:
+        return key.strip(), value.strip()  # a bare word: --set tracker=kalman
+
+
+def _explain(error: ValidationError, path: Path) -> tuple[str]:
+    faults = "; ".join(
+        f"{'.'.join(str(part) for part in fault['loc'])}: {fault['msg']}"
+        + ("" if fault["type"] == "missing" else f" (got {fault['input']!r})")
+        for fault in error.errors()
+    )
+    return (f"{path}: {faults}. Correct the value in the file or the --set option.",)

@@ -1,0 +1,1 @@
+"""The inside world: schemas, GeoParquet store, DuckDB."""

@@ -1,0 +1,1 @@
+"""One vocabulary of traffic signs."""
