@@ -56,7 +56,8 @@ class Schema:
         """
         kept = self.columns + tuple(c for c in self.optional if names is None or c.name in names)
         fields = [
-            pa.field(c.name, c.type, c.nullable, metadata={b"description": c.description.encode()}) for c in kept
+            pa.field(c.name, c.type, c.nullable, metadata={b"description": c.description.encode()})
+            for c in kept
         ]
         if self.geometry:
             fields.append(pa.field(GEOMETRY, pa.binary(), self.geometry_nullable))
@@ -209,7 +210,11 @@ DETECTIONS = Schema(
         _c("frame_first?", INT, "number of the first frame with the object"),
         _c("frame_last?", INT, "number of the last frame with the object"),
         _c("n_frames?", INT, "frames with the object"),
-        _c("sigma_e_m?", FLOAT, "spread over frames, east, F - 1 in the denominator; not the error of the mean"),
+        _c(
+            "sigma_e_m?",
+            FLOAT,
+            "spread over frames, east, F - 1 in the denominator; not the error of the mean",
+        ),
         _c("sigma_n_m?", FLOAT, "spread over frames, north"),
         _c("cov_en_m2?", FLOAT, "covariance over frames, east and north"),
         _c("range_mean_m?", FLOAT, "mean measured range"),
@@ -224,7 +229,11 @@ DETECTIONS = Schema(
         _c("country?", TEXT, "ISO 3166-1 alpha-2"),
         _c("info_lon?", FLOAT, "origin of the information form, degrees"),
         _c("info_lat?", FLOAT, "origin of the information form, degrees"),
-        _c("info_matrix?", pa.list_(FLOAT, 10), "upper triangle of N over east, north, range bias, bearing bias"),
+        _c(
+            "info_matrix?",
+            pa.list_(FLOAT, 10),
+            "upper triangle of N over east, north, range bias, bearing bias",
+        ),
         _c("info_vector?", pa.list_(FLOAT, 4), "N times the estimate"),
         _c("info_s0?", FLOAT, "residual sum of squares"),
         _c("info_dof?", FLOAT, "degrees of freedom of the residual"),
@@ -297,8 +306,5 @@ SCORES = Schema(
 )
 
 SCHEMAS = MappingProxyType(
-    {
-        s.name: s
-        for s in (SIGNS, RUNS, REFERENCE, LANES, DRIVES, PASSES, DETECTIONS, TRUTH, MATCHES, SCORES)
-    }
+    {s.name: s for s in (SIGNS, RUNS, REFERENCE, LANES, DRIVES, PASSES, DETECTIONS, TRUTH, MATCHES, SCORES)}
 )

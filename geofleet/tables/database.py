@@ -1,0 +1,163 @@
+"""DuckDB with its spatial extension, and the statements in `sql/`.
+
+Python binds logical table names (`con.register`, temporary views) and `$params`; a file holds one statement. Session
+variables are not used: DuckDB fills a missing parameter from one silently.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import duckdb
+
+from geofleet.errors import QueryError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_HEADER = re.compile(r"^--\s*(why|reads|params|writes):\s*(.*)$")
+_PARAMETER = re.compile(r"\$([a-z_]\w*)")
+
+
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """One `.sql` file: its text and what its header says."""
+
+    name: str
+    text: str
+    why: str
+    reads: tuple[str, ...]
+    params: tuple[str, ...]
+    writes: tuple[tuple[str, str], ...]
+
+
+def connect(*, threads: int | None = None, memory_limit: str | None = None) -> duckdb.DuckDBPyConnection:
+    """Open an in-memory database with spatial loaded, x before y, and rows in a stable order.
+
+    Raises
+    ------
+    QueryError
+        The spatial extension is nowhere to be found.
+    """
+    config: dict[str, Any] = {"autoinstall_known_extensions": False}
+    if threads:
+        config["threads"] = threads
+    if memory_limit:
+        config["memory_limit"] = memory_limit
+    connection = duckdb.connect(config=config)
+    _load_spatial(connection)
+    connection.execute("SET geometry_always_xy = true")
+    return connection
+
+
+def _load_spatial(connection: duckdb.DuckDBPyConnection) -> None:
+    """Load spatial from its wheel, from DuckDB's own folder, or from the net, in that order."""
+    attempts = [
+        *(f"LOAD '{path}'" for path in _packaged_spatial()),
+        "LOAD spatial",
+        "INSTALL spatial; LOAD spatial",
+    ]
+    faults = []
+    for attempt in attempts:
+        try:
+            connection.execute(attempt)
+        except duckdb.Error as error:
+            faults.append(str(error).splitlines()[0])
+        else:
+            return
+    raise QueryError(
+        f"DuckDB's spatial extension cannot be loaded ({faults[0]}).",
+        todo=f"Run: pip install duckdb-extension-spatial=={duckdb.__version__}",
+    )
+
+
+def _packaged_spatial() -> list[str]:
+    try:
+        import duckdb_extension_spatial  # noqa: PLC0415  (optional: an installed extension does as well)
+    except ImportError:
+        return []
+    folder = Path(duckdb_extension_spatial.__file__).parent / "extensions" / f"v{duckdb.__version__}"
+    return [str(path).replace("'", "''") for path in folder.glob("spatial.duckdb_extension")]
+
+
+def sql_folder() -> Path:
+    """Return the folder of the statements: inside the package when installed, else the checkout's `sql/`."""
+    package = Path(__file__).resolve().parent.parent
+    packed = package / "_sql"
+    return packed if packed.is_dir() else package.parent / "sql"
+
+
+@cache
+def load_sql(name: str) -> Statement:
+    """Read a statement by its path below `sql/` without the suffix, e.g. `tiles/assign`.
+
+    Raises
+    ------
+    QueryError
+        There is no such file, or its header does not name the parameters that its text uses.
+    """
+    path = sql_folder() / f"{name}.sql"
+    if not path.is_file():
+        raise QueryError(f"there is no statement {name!r}.", where=str(path))
+    text = path.read_text(encoding="utf-8")
+    header: dict[str, list[str]] = {"why": [], "reads": [], "params": [], "writes": []}
+    current = ""
+    for line in text.splitlines():
+        match = _HEADER.match(line)
+        if match:
+            current, rest = match[1], match[2]
+        elif line.startswith("--") and current:
+            rest = line.removeprefix("--").strip()
+        else:
+            current = ""
+            continue
+        header[current].append(rest)
+    declared = set(_PARAMETER.findall(" ".join(header["params"])))
+    body = "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("--"))
+    used = set(_PARAMETER.findall(body))
+    if declared != used:
+        odd = ", ".join(sorted(f"${p}" for p in declared ^ used))
+        raise QueryError(f"{odd} stands either in the header or in the text, not in both.", where=str(path))
+    return Statement(
+        name=name,
+        text=text,
+        why=" ".join(header["why"]),
+        reads=tuple(word.strip() for word in ",".join(header["reads"]).split(",") if word.strip()),
+        params=tuple(sorted(declared)),
+        writes=_parse_columns(" ".join(header["writes"])),
+    )
+
+
+def _parse_columns(text: str) -> tuple[tuple[str, str], ...]:
+    """Split `a INTEGER, b DECIMAL(1, 2)` at the commas outside brackets."""
+    parts = re.split(r",\s*(?![^(]*\))", text.strip().rstrip("."))
+    return tuple(
+        (name, kind.strip()) for name, _, kind in (part.strip().partition(" ") for part in parts) if name
+    )
+
+
+def run(
+    connection: duckdb.DuckDBPyConnection, name: str, params: Mapping[str, Any] | None = None
+) -> duckdb.DuckDBPyConnection:
+    """Execute the statement of a file with its parameters and return the connection that holds its result.
+
+    Raises
+    ------
+    QueryError
+        A parameter is missing or unknown, or DuckDB refuses the statement; the message names the file.
+    """
+    statement = load_sql(name)
+    given = dict(params or {})
+    if set(given) != set(statement.params):
+        raise QueryError(
+            f"takes the parameters {', '.join(statement.params) or 'none'}, got {', '.join(sorted(given)) or 'none'}.",
+            where=f"sql/{name}.sql",
+        )
+    try:
+        return connection.execute(statement.text, given)
+    except duckdb.Error as error:
+        raise QueryError(f"{str(error).strip()}", where=f"sql/{name}.sql") from error

@@ -1,0 +1,316 @@
+"""GeoParquet files: built to a schema, checked against it, sorted by key, and there whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import uuid
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+import shapely
+
+from geofleet.errors import InputError, TableError
+from geofleet.tables.schemas import BBOX, BBOX_TYPE, GEOMETRY, SCHEMAS, Schema
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from geopandas import GeoDataFrame
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+_COMPRESSION = "zstd"
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yield a path beside `path` to write a file or folder at; on success it takes the place of `path`.
+
+    On failure nothing is left behind and what stood at `path` is untouched.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write here: {error.strerror}.", where=str(path)) from None
+    draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
+    try:
+        yield draft
+        if draft.is_dir() and path.is_dir():
+            old = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.old")
+            path.rename(old)
+            draft.rename(path)
+            shutil.rmtree(old)
+        else:
+            os.replace(draft, path)  # noqa: PTH105  (Path.replace cannot overwrite on Windows either; same call)
+    finally:
+        if draft.is_dir():
+            shutil.rmtree(draft)
+        else:
+            draft.unlink(missing_ok=True)
+
+
+def build_table(
+    schema: Schema,
+    columns: Mapping[str, Any],
+    geometry: tuple[Floats, Floats] | Sequence[Any] | NDArray[Any] | None = None,
+) -> pa.Table:
+    """Make a table of a schema from columns.
+
+    Parameters
+    ----------
+    schema
+        The table to make.
+    columns
+        Name to array, list, Arrow array or scalar. A scalar is repeated. A missing nullable column becomes null.
+        Optional columns are in the table when they are given.
+    geometry
+        Longitudes and latitudes of points in degrees, or shapely geometries (None where the schema allows it).
+
+    Raises
+    ------
+    TableError
+        A column is missing, unknown, of the wrong type or length, or has nulls that the schema forbids.
+    """
+    known = {c.name: c for c in schema.all_columns}
+    unknown = sorted(set(columns) - set(known))
+    if unknown:
+        raise TableError(f"unknown columns {', '.join(unknown)}.", where=f"table {schema.name}")
+    n_rows = _n_rows(columns, geometry)
+    arrow = schema.arrow(tuple(columns))
+    arrays = []
+    for field in arrow:
+        if field.name in (GEOMETRY, BBOX):
+            continue
+        arrays.append(_column(schema, field, columns.get(field.name), n_rows))
+    if schema.geometry:
+        arrays.extend(_encode(schema, geometry, n_rows))
+    return sort_by_key(schema, pa.Table.from_arrays(arrays, schema=arrow))
+
+
+def sort_by_key(schema: Schema, table: pa.Table) -> pa.Table:
+    """Return the rows in the order of the schema's key; files are written in it."""
+    keys = [(name, "ascending") for name in schema.key if name in table.column_names]
+    return table.take(pc.sort_indices(table, sort_keys=keys, null_placement="at_start")) if keys else table
+
+
+def write_table(schema: Schema, table: pa.Table, path: Path) -> None:
+    """Write a table made by `build_table` as GeoParquet 1.1 with a bbox covering, atomically.
+
+    The same table gives the same bytes. Partition columns that are not in the table stay out of the file.
+    """
+    with atomic_path(path) as draft:
+        pq.write_table(
+            table.replace_schema_metadata(geo_metadata(schema, table)), draft, compression=_COMPRESSION
+        )
+
+
+def geo_metadata(schema: Schema, table: pa.Table) -> dict[bytes, bytes]:
+    """Return the file metadata: `geo` of GeoParquet 1.1 (OGC:CRS84 by default) and the name of the table."""
+    metadata = {b"geofleet:table": schema.name.encode()}
+    if schema.geometry:
+        column: dict[str, Any] = {
+            "encoding": "WKB",
+            "geometry_types": [schema.geometry],
+            "covering": {"bbox": {side: [BBOX, side] for side in ("xmin", "ymin", "xmax", "ymax")}},
+        }
+        extent = _extent(table)
+        if extent:
+            column["bbox"] = extent
+        geo = {"version": "1.1.0", "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
+        metadata[b"geo"] = json.dumps(geo, sort_keys=True).encode()
+    return metadata
+
+
+def read_table(schema: Schema, path: Path, columns: Sequence[str] | None = None) -> pa.Table:
+    """Read a table from a file, or from a hive-partitioned folder of files, and check it against its schema.
+
+    Parameters
+    ----------
+    schema
+        The table that the file must hold.
+    path
+        A Parquet file or a folder of them.
+    columns
+        Read only these (and fail if they are missing); all by default.
+
+    Raises
+    ------
+    InputError
+        The file does not exist or is not Parquet.
+    TableError
+        A column is missing or mistyped, or has nulls that the schema forbids.
+    """
+    dataset = _open(schema, Path(path))
+    present = set(dataset.schema.names)
+    arrow = schema.arrow(tuple(present))
+    wanted = [f for f in arrow if columns is None or f.name in columns]
+    missing = [f.name for f in wanted if f.name not in present]
+    if missing:
+        raise TableError(
+            f"missing column {', '.join(missing)}.",
+            where=f"{path}: table {schema.name}",
+            todo=f"`geofleet schema {schema.name}` prints what it must hold.",
+        )
+    try:
+        table = dataset.to_table(columns=[f.name for f in wanted])
+    except (pa.ArrowInvalid, OSError) as error:
+        raise InputError(f"cannot be read: {error}.", where=str(path), todo="Write the file anew.") from None
+    return pa.Table.from_arrays(
+        [_conform(schema, field, table[field.name], path) for field in wanted], schema=pa.schema(wanted)
+    )
+
+
+def lonlat(table: pa.Table) -> tuple[Floats, Floats]:
+    """Return longitude and latitude, degrees, of a table of points, from its bbox column."""
+    bbox = table[BBOX].combine_chunks()
+    return bbox.field("xmin").to_numpy(zero_copy_only=False), bbox.field("ymin").to_numpy(
+        zero_copy_only=False
+    )
+
+
+def to_geodataframe(table: pa.Table) -> GeoDataFrame:
+    """Return the table as a GeoDataFrame in OGC:CRS84, without its bbox column."""
+    import geopandas  # noqa: PLC0415  (a second of import that only this function needs)
+
+    plain = table.drop_columns([GEOMETRY, BBOX])
+    frame = plain.to_pandas(ignore_metadata=True)
+    geometry = shapely.from_wkb(table[GEOMETRY].to_numpy(zero_copy_only=False))
+    return geopandas.GeoDataFrame(frame, geometry=geometry, crs="OGC:CRS84")
+
+
+def from_geodataframe(schema: Schema, frame: GeoDataFrame) -> pa.Table:
+    """Return a GeoDataFrame in any CRS as a table of a schema; columns that the schema does not know are dropped.
+
+    Raises
+    ------
+    InputError
+        The frame has no CRS.
+    TableError
+        As `build_table`.
+    """
+    if frame.crs is None:
+        raise InputError("the GeoDataFrame has no CRS.", todo="Set one with set_crs().")
+    if not frame.crs.equals("OGC:CRS84"):
+        frame = frame.to_crs("OGC:CRS84")
+    names = [c.name for c in schema.all_columns if c.name in frame.columns]
+    columns = {name: pa.array(frame[name], from_pandas=True) for name in names}
+    return build_table(schema, columns, geometry=np.asarray(frame.geometry.array))
+
+
+def schema_named(name: str) -> Schema:
+    """Return the schema of a table by its name, or raise a TableError that lists the names."""
+    if name not in SCHEMAS:
+        raise TableError(f"there is no table {name!r}.", todo=f"Tables are {', '.join(SCHEMAS)}.")
+    return SCHEMAS[name]
+
+
+def _n_rows(columns: Mapping[str, Any], geometry: Any) -> int:
+    if isinstance(geometry, tuple):
+        return len(geometry[0])
+    if geometry is not None:
+        return len(geometry)
+    lengths = [len(v) for v in columns.values() if _is_array(v)]
+    return lengths[0] if lengths else 1
+
+
+def _is_array(value: Any) -> bool:
+    return not isinstance(value, str | bytes) and hasattr(value, "__len__")
+
+
+def _column(schema: Schema, field: pa.Field, value: Any, n_rows: int) -> pa.Array:
+    where = f"table {schema.name}"
+    if value is None and not field.nullable:
+        raise TableError(f"missing column {field.name}.", where=where)
+    try:
+        if _is_array(value):
+            array = _cast(value if isinstance(value, pa.Array) else pa.array(value, from_pandas=True), field)
+        else:
+            array = pa.repeat(pa.scalar(value, type=field.type), n_rows)
+    except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError) as error:
+        raise TableError(f"column {field.name} is not {field.type}: {error}.", where=where) from None
+    if len(array) != n_rows:
+        raise TableError(f"column {field.name} has {len(array)} rows, not {n_rows}.", where=where)
+    if array.null_count and not field.nullable:
+        raise TableError(f"column {field.name} has {array.null_count} nulls of {n_rows}.", where=where)
+    return array
+
+
+def _cast(array: pa.Array | pa.ChunkedArray, field: pa.Field) -> pa.Array | pa.ChunkedArray:
+    """Cast to the type of a field; text never turns into numbers or times by itself."""
+    textual = pa.types.is_string(array.type) or pa.types.is_large_string(array.type)
+    if textual and not pa.types.is_string(field.type):
+        raise pa.ArrowTypeError(f"found {array.type}")
+    return array.cast(field.type)
+
+
+def _encode(schema: Schema, geometry: Any, n_rows: int) -> list[pa.Array]:
+    """Return the WKB and the bbox column."""
+    if isinstance(geometry, tuple):
+        lon, lat = (np.ascontiguousarray(side, np.float64) for side in geometry)
+        wkb = pa.array(shapely.to_wkb(shapely.points(lon, lat)), pa.binary())
+        bounds, empty = np.column_stack((lon, lat, lon, lat)), np.zeros(n_rows, bool)
+    else:
+        shapes = np.asarray([None] * n_rows if geometry is None else geometry, dtype=object)
+        empty = np.asarray(shapely.is_missing(shapes))
+        wkb = pa.array(shapely.to_wkb(shapes), pa.binary())
+        bounds = shapely.bounds(shapes)
+    if empty.any() and not schema.geometry_nullable:
+        raise TableError(
+            f"{int(empty.sum())} of {n_rows} geometries are missing.", where=f"table {schema.name}"
+        )
+    sides = [pa.array(bounds[:, i]) for i in range(4)]
+    mask = pa.array(empty) if empty.any() else None
+    return [wkb, pa.StructArray.from_arrays(sides, fields=list(BBOX_TYPE), mask=mask)]
+
+
+def _extent(table: pa.Table) -> list[float]:
+    if table.num_rows == table[BBOX].null_count:
+        return []
+    box = pc.struct_field
+    low = [pc.min(box(table[BBOX], side)).as_py() for side in ("xmin", "ymin")]
+    high = [pc.max(box(table[BBOX], side)).as_py() for side in ("xmax", "ymax")]
+    return [*low, *high]
+
+
+def _open(schema: Schema, path: Path) -> ds.Dataset:
+    if not path.exists():
+        raise InputError("there is no such file.", where=str(path), todo="Check the path.")
+    partitioning = ds.partitioning(
+        pa.schema([(name, pa.string()) for name in schema.partitions]), flavor="hive"
+    )
+    try:
+        dataset = ds.dataset(path, format="parquet", partitioning=partitioning if path.is_dir() else None)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise InputError(
+            f"not a Parquet file ({str(error).splitlines()[0]}).",
+            where=str(path),
+            todo=f"A {schema.name} table is expected; `geofleet ingest` makes one from other formats.",
+        ) from None
+    if not dataset.files:
+        raise InputError("the folder holds no Parquet file.", where=str(path), todo="Check the path.")
+    return dataset
+
+
+def _conform(schema: Schema, field: pa.Field, column: pa.ChunkedArray, path: Path) -> pa.ChunkedArray:
+    where = f"{path}: table {schema.name}"
+    try:
+        column = _cast(column, field)
+    except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError):
+        raise TableError(
+            f"column {field.name} is {column.type}, not {field.type}.",
+            where=where,
+            todo=f"`geofleet schema {schema.name}` prints the types.",
+        ) from None
+    if column.null_count and not field.nullable:
+        raise TableError(f"column {field.name} has {column.null_count} nulls of {len(column)}.", where=where)
+    return column
