@@ -127,9 +127,7 @@ def packaged_scenarios() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
-def load_config(
-    scenario: str | Path = ROOT_SCENARIO, overrides: Mapping[str, Any] | Iterable[str] = ()
-) -> Config:
+def load_config(scenario: str | Path = ROOT_SCENARIO, overrides: Mapping[str, Any] | Iterable[str] = ()) -> Config:
     """Read a scenario and apply overrides.
 
     Parameters
@@ -146,11 +144,7 @@ def load_config(
     """
     path = _find(scenario)
     tree = _read(path, seen=())
-    pairs = (
-        overrides.items()
-        if hasattr(overrides, "items")
-        else (_split_override(text) for text in overrides)
-    )
+    pairs = overrides.items() if hasattr(overrides, "items") else (_split_override(text) for text in overrides)
     for key, value in pairs:
         section, name = _locate(key, where="--set")
         tree[section][name] = value
@@ -182,9 +176,7 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, dict[str, Any]]:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"not valid TOML: {error}.", where=str(path), todo="Mend the file.") from None
     base = own.pop("base", None if path == packaged_scenarios()[ROOT_SCENARIO] else ROOT_SCENARIO)
-    tree: dict[str, dict[str, Any]] = (
-        _read(_find(base), (*seen, path)) if base else {name: {} for name in SECTIONS}
-    )
+    tree: dict[str, dict[str, Any]] = _read(_find(base), (*seen, path)) if base else {name: {} for name in SECTIONS}
     for section, keys in own.items():
         if section not in SECTIONS or not isinstance(keys, dict):
             raise ConfigError(

@@ -135,9 +135,7 @@ def load_sql(name: str) -> Statement:
 def _parse_columns(text: str) -> tuple[tuple[str, str], ...]:
     """Split `a INTEGER, b DECIMAL(1, 2)` at the commas outside brackets."""
     parts = re.split(r",\s*(?![^(]*\))", text.strip().rstrip("."))
-    return tuple(
-        (name, kind.strip()) for name, _, kind in (part.strip().partition(" ") for part in parts) if name
-    )
+    return tuple((name, kind.strip()) for name, _, kind in (part.strip().partition(" ") for part in parts) if name)
 
 
 def run(

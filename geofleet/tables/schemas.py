@@ -55,10 +55,7 @@ class Schema:
         Geometry is WKB; `bbox` is the covering of GeoParquet 1.1.
         """
         kept = self.columns + tuple(c for c in self.optional if names is None or c.name in names)
-        fields = [
-            pa.field(c.name, c.type, c.nullable, metadata={b"description": c.description.encode()})
-            for c in kept
-        ]
+        fields = [pa.field(c.name, c.type, c.nullable, metadata={b"description": c.description.encode()}) for c in kept]
         if self.geometry:
             fields.append(pa.field(GEOMETRY, pa.binary(), self.geometry_nullable))
             fields.append(pa.field(BBOX, BBOX_TYPE, self.geometry_nullable))

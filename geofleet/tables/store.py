@@ -100,7 +100,7 @@ def build_table(
 def sort_by_key(schema: Schema, table: pa.Table) -> pa.Table:
     """Return the rows in the order of the schema's key; files are written in it."""
     keys = [(name, "ascending") for name in schema.key if name in table.column_names]
-    return table.take(pc.sort_indices(table, sort_keys=keys, null_placement="at_start")) if keys else table
+    return table.take(pc.sort_indices(table, sort_keys=keys)) if keys else table
 
 
 def write_table(schema: Schema, table: pa.Table, path: Path) -> None:
@@ -109,9 +109,7 @@ def write_table(schema: Schema, table: pa.Table, path: Path) -> None:
     The same table gives the same bytes. Partition columns that are not in the table stay out of the file.
     """
     with atomic_path(path) as draft:
-        pq.write_table(
-            table.replace_schema_metadata(geo_metadata(schema, table)), draft, compression=_COMPRESSION
-        )
+        pq.write_table(table.replace_schema_metadata(geo_metadata(schema, table)), draft, compression=_COMPRESSION)
 
 
 def geo_metadata(schema: Schema, table: pa.Table) -> dict[bytes, bytes]:
@@ -173,9 +171,7 @@ def read_table(schema: Schema, path: Path, columns: Sequence[str] | None = None)
 def lonlat(table: pa.Table) -> tuple[Floats, Floats]:
     """Return longitude and latitude, degrees, of a table of points, from its bbox column."""
     bbox = table[BBOX].combine_chunks()
-    return bbox.field("xmin").to_numpy(zero_copy_only=False), bbox.field("ymin").to_numpy(
-        zero_copy_only=False
-    )
+    return bbox.field("xmin").to_numpy(zero_copy_only=False), bbox.field("ymin").to_numpy(zero_copy_only=False)
 
 
 def to_geodataframe(table: pa.Table) -> GeoDataFrame:
@@ -265,9 +261,7 @@ def _encode(schema: Schema, geometry: Any, n_rows: int) -> list[pa.Array]:
         wkb = pa.array(shapely.to_wkb(shapes), pa.binary())
         bounds = shapely.bounds(shapes)
     if empty.any() and not schema.geometry_nullable:
-        raise TableError(
-            f"{int(empty.sum())} of {n_rows} geometries are missing.", where=f"table {schema.name}"
-        )
+        raise TableError(f"{int(empty.sum())} of {n_rows} geometries are missing.", where=f"table {schema.name}")
     sides = [pa.array(bounds[:, i]) for i in range(4)]
     mask = pa.array(empty) if empty.any() else None
     return [wkb, pa.StructArray.from_arrays(sides, fields=list(BBOX_TYPE), mask=mask)]
@@ -285,9 +279,7 @@ def _extent(table: pa.Table) -> list[float]:
 def _open(schema: Schema, path: Path) -> ds.Dataset:
     if not path.exists():
         raise InputError("there is no such file.", where=str(path), todo="Check the path.")
-    partitioning = ds.partitioning(
-        pa.schema([(name, pa.string()) for name in schema.partitions]), flavor="hive"
-    )
+    partitioning = ds.partitioning(pa.schema([(name, pa.string()) for name in schema.partitions]), flavor="hive")
     try:
         dataset = ds.dataset(path, format="parquet", partitioning=partitioning if path.is_dir() else None)
     except (pa.ArrowInvalid, OSError) as error:
