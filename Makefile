@@ -1,0 +1,103 @@
+# The pipeline as file targets: a step's target is the manifest that it writes last, so `make` redoes only what changed.
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+GEOFLEET := $(BIN)/geofleet
+READY := $(VENV)/.ready
+
+P := data/processed
+MAP ?= data/raw/helsinki.osm.pbf
+DRIVE ?= data/raw/helsinki_derived.pos
+SCENARIO ?= paper
+VEHICLES ?= 50
+REPLICATES ?= 1
+SEED ?= 0
+CODE := $(shell find geofleet sql -name '*.py' -o -name '*.sql' -o -name '*.toml' -o -name '*.csv' 2>/dev/null)
+
+.PHONY: FORCE help setup demo test check ingest simulate aggregate evaluate report format lock clean
+
+help: ## List the targets
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+setup: $(READY) ## Make the virtual environment .venv from the lock file
+
+# uv when it is there, else venv and pip; the same locked, hashed versions either way.
+$(READY): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "geofleet needs Python 3.11 or newer; name one: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 2; }
+	@if command -v uv >/dev/null && uv --version >/dev/null 2>&1; then \
+	  echo "setting up $(VENV) with uv"; \
+	  uv venv --quiet --clear --python "$$($(PYTHON) -c 'import sys; print(sys.executable)')" $(VENV); \
+	  uv pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock; \
+	  uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e .; \
+	else \
+	  echo "setting up $(VENV) with pip (some minutes)"; \
+	  $(PYTHON) -m venv --clear $(VENV); \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock; \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .; \
+	fi
+	@touch $@
+
+demo: $(P)/report/_manifest.json ## Set up, run the main job on the shipped data, name what to open
+	@$(GEOFLEET) demo --show --out $(P)
+
+ingest: $(P)/signs/signs_manifest.json $(P)/lanes/lanes_manifest.json $(P)/drives/drives_manifest.json ## Maps and drives into tables
+simulate: $(P)/simulation/_manifest.json ## A fleet past the signs
+aggregate: $(P)/fused/fused_manifest.json ## Detections into a map
+evaluate: $(P)/evaluation/_manifest.json ## The map against its reference
+report: $(P)/report/_manifest.json ## The picture
+
+# Stamps of the variables above: a file that changes when, and only when, its values change.
+$(P)/.inputs: VALUES = $(MAP) $(DRIVE)
+$(P)/.fleet: VALUES = $(SCENARIO) $(VEHICLES) $(REPLICATES) $(SEED)
+$(P)/.inputs $(P)/.fleet: FORCE
+	@mkdir -p $(P); echo "$(VALUES)" | cmp -s - $@ || echo "$(VALUES)" > $@
+
+$(P)/signs/signs_manifest.json: $(P)/.inputs $(MAP) $(CODE) | $(READY)
+	$(GEOFLEET) ingest signs $(MAP) --out $(P)/signs/signs.parquet
+
+$(P)/lanes/lanes_manifest.json: $(P)/.inputs $(MAP) $(CODE) | $(READY)
+	$(GEOFLEET) ingest lanes $(MAP) --out $(P)/lanes/lanes.parquet
+
+$(P)/drives/drives_manifest.json: $(P)/.inputs $(DRIVE) $(CODE) | $(READY)
+	$(GEOFLEET) ingest drive $(DRIVE) --out $(P)/drives/drives.parquet
+
+$(P)/simulation/_manifest.json: $(P)/.fleet $(P)/signs/signs_manifest.json $(P)/drives/drives_manifest.json
+	$(GEOFLEET) simulate --signs $(P)/signs/signs.parquet --drive $(P)/drives/drives.parquet \
+	  --scenario $(SCENARIO) --vehicles $(VEHICLES) --replicates $(REPLICATES) --seed $(SEED) --out $(P)/simulation
+
+$(P)/fused/fused_manifest.json: $(P)/simulation/_manifest.json
+	$(GEOFLEET) aggregate --detections $(P)/simulation/detections --scenario $(SCENARIO) --out $(P)/fused/fused.parquet
+
+$(P)/evaluation/_manifest.json: $(P)/fused/fused_manifest.json
+	$(GEOFLEET) evaluate --map $(P)/fused/fused.parquet --reference $(P)/simulation/reference.parquet \
+	  --scenario $(SCENARIO) --out $(P)/evaluation
+
+$(P)/report/_manifest.json: $(P)/evaluation/_manifest.json $(P)/lanes/lanes_manifest.json
+	$(GEOFLEET) report $(P)
+
+test: $(READY) ## Set up and pass every test
+	$(BIN)/pytest -q
+
+check: $(READY) ## Every gate: format, lint, types, import direction, SQL contracts
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/pytest -q tests/sql
+
+format: $(READY) ## Format the code
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+lock: ## Resolve the lock file anew (needs uv)
+	uv pip compile --quiet --universal --python-version 3.11 --group dev --generate-hashes --no-emit-index-url \
+	  --custom-compile-command 'make lock' pyproject.toml -o requirements.lock
+
+clean: ## Remove what the steps made
+	rm -rf $(P)/*/

@@ -1,0 +1,380 @@
+"""The `geofleet` command: parses, calls one step or workflow, prints. Nothing else prints, exits or draws progress.
+
+Exit codes: 0 done, 1 a check failed, 2 bad usage or bad input (one message, no traceback).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from geofleet.errors import GeofleetError, InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from geofleet.config import Config
+
+app = typer.Typer(
+    name="geofleet",
+    help="Turn the traffic-sign detections of many cars into an updated sign map, and say how good it is.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+ingest_app = typer.Typer(no_args_is_help=True, help="Load sign maps, roads and drives into GeoParquet tables.")
+app.add_typer(ingest_app, name="ingest")
+
+Inputs = Annotated[list[Path], typer.Argument(help="Files to read.", show_default=False)]
+Out = Annotated[Path, typer.Option("--out", help="Table to write.")]
+OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="A TOML file of settings.")]
+Scenario = Annotated[str, typer.Option("--scenario", help="Name of a packaged scenario, or a TOML file.")]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", help="Override any key: --set eps_m=4.0", metavar="KEY=VALUE")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Workers = Annotated[int, typer.Option("--workers", min=1, help="Worker threads; the result does not depend on it.")]
+N_CORES = os.cpu_count() or 1
+
+
+def main() -> None:
+    """Run the command line; every expected fault ends in one message and exit code 2."""
+    try:
+        app()
+    except GeofleetError as error:
+        _fail(str(error))
+    except OSError as error:
+        _fail(str(InputError(f"{error.strerror or error}.", where=str(error.filename or ""))))
+
+
+def _fail(message: str) -> None:
+    sys.stderr.write(f"geofleet: {message}\n")
+    raise SystemExit(2)
+
+
+@ingest_app.command("signs")
+def ingest_signs(
+    inputs: Inputs,
+    out: Out,
+    file_format: Annotated[str, typer.Option("--format", help="auto or osm.")] = "auto",
+    roads: Annotated[bool, typer.Option("--roads/--no-roads", help="Infer facing and road from the ways.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Read signs from maps into a `signs` table.
+
+    Example: geofleet ingest signs data/raw/helsinki.osm.pbf --out signs.parquet
+    """
+    from geofleet.steps import ingest
+
+    with _progress("reading signs") as progress:
+        result = ingest.ingest_signs(inputs, out, file_format=file_format, roads=roads, progress=progress)
+    _report(result, as_json=as_json)
+
+
+@ingest_app.command("lanes")
+def ingest_lanes(inputs: Inputs, out: Out, as_json: AsJson = False) -> None:
+    """Read drivable roads or lanes into a `lanes` table.
+
+    Example: geofleet ingest lanes data/raw/helsinki.osm.pbf --out lanes.parquet
+    """
+    from geofleet.steps import ingest
+
+    with _progress("reading roads") as progress:
+        result = ingest.ingest_lanes(inputs, out, progress=progress)
+    _report(result, as_json=as_json)
+
+
+@ingest_app.command("drive")
+def ingest_drive(inputs: Inputs, out: Out, as_json: AsJson = False) -> None:
+    """Read trajectories into a `drives` table.
+
+    Example: geofleet ingest drive data/raw/helsinki_derived.pos --out drives.parquet
+    """
+    from geofleet.steps import ingest
+
+    with _progress("reading drives") as progress:
+        result = ingest.ingest_drive(inputs, out, progress=progress)
+    _report(result, as_json=as_json)
+
+
+@app.command()
+def simulate(
+    signs: Annotated[Path, typer.Option("--signs", help="A signs table.")],
+    drive: Annotated[Path, typer.Option("--drive", help="A drives table.")],
+    out: OutFolder,
+    scenario: Scenario = "paper",
+    vehicles: Annotated[int, typer.Option("--vehicles", help="Size of the fleet.")] = 50,
+    replicates: Annotated[int, typer.Option("--replicates", help="Independent repetitions.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", help="Of all random numbers.")] = 0,
+    corridor_m: Annotated[float | None, typer.Option(help="Signs this near to the drive are the scene.")] = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    workers: Workers = N_CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a fleet that drives past real signs: reference, passes, detections, truth.
+
+    Example: geofleet simulate --signs signs.parquet --drive drives.parquet --vehicles 50 --out simulation
+    """
+    from geofleet.steps import simulate as step
+
+    settled = _settle(config or scenario, settings, corridor_m=corridor_m)
+    with _progress("simulating") as progress:
+        result = step.simulate(
+            signs,
+            drive,
+            out,
+            config=settled,
+            n_vehicles=vehicles,
+            n_replicates=replicates,
+            seed=seed,
+            n_workers=workers,
+            progress=progress,
+        )
+    _report(result, as_json=as_json)
+
+
+@app.command()
+def aggregate(
+    detections: Annotated[Path, typer.Option("--detections", help="A detections table or folder.")],
+    out: Out,
+    vehicles: Annotated[int | None, typer.Option("--vehicles", help="Use the first V vehicles only.")] = None,
+    method: Annotated[str | None, typer.Option(help="dbscan.")] = None,
+    semantic: Annotated[str | None, typer.Option(help="first or after.")] = None,
+    eps_m: Annotated[float | None, typer.Option(help="Radius of a neighbourhood.")] = None,
+    min_samples: Annotated[int | None, typer.Option(help="Detections that make a core.")] = None,
+    min_support: Annotated[int | None, typer.Option(help="Passes that a sign needs.")] = None,
+    tile_zoom: Annotated[int | None, typer.Option(help="Size of the tiles; the result does not depend on it.")] = None,
+    config: ConfigFile = None,
+    scenario: Scenario = "paper",
+    settings: Settings = None,
+    workers: Workers = N_CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Cluster detections per tile and fuse them into a sign map.
+
+    Example: geofleet aggregate --detections simulation/detections --out fused.parquet
+    """
+    from geofleet.steps import aggregate as step
+
+    settled = _settle(
+        config or scenario,
+        settings,
+        method=method,
+        semantic=semantic,
+        eps_m=eps_m,
+        min_samples=min_samples,
+        min_support=min_support,
+        tile_zoom=tile_zoom,
+    )
+    with _progress("aggregating") as progress:
+        result = step.aggregate(
+            detections, out, config=settled, n_vehicles=vehicles, n_workers=workers, progress=progress
+        )
+    _report(result, as_json=as_json)
+
+
+@app.command()
+def evaluate(
+    map_: Annotated[Path, typer.Option("--map", help="The map to score.")],
+    reference: Annotated[Path, typer.Option("--reference", help="The map to trust.")],
+    out: OutFolder,
+    gate: Annotated[float | None, typer.Option("--gate", help="c: a match is nearer than this, metres.")] = None,
+    match_on: Annotated[str | None, typer.Option(help="class, concept or none.")] = None,
+    require: Annotated[list[str] | None, typer.Option(help='Exit 1 when missed: "gospa_m<0.8".')] = None,
+    config: ConfigFile = None,
+    scenario: Scenario = "paper",
+    settings: Settings = None,
+    as_json: AsJson = False,
+) -> None:
+    """Score a sign map against a reference: GOSPA_M, precision, recall, F1.
+
+    Example: geofleet evaluate --map fused.parquet --reference simulation/reference.parquet --out evaluation
+    """
+    from geofleet.steps import evaluate as step
+
+    settled = _settle(config or scenario, settings, gate_m=gate, match_on=match_on)
+    requirements = step.parse_requirements(require or [])
+    result = step.evaluate(map_, reference, out, config=settled)
+    missed = step.missed_requirements(result.totals, requirements)
+    if as_json:
+        _print_json({**asdict(result), "missed": missed})
+    else:
+        _print_scores(result.totals)
+        _print_files(result.files)
+    for sentence in missed:
+        sys.stderr.write(f"geofleet: {sentence}\n")
+    if missed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def report(
+    run_dir: Annotated[Path, typer.Argument(help="Folder with signs, lanes, drives, simulation and evaluation.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; RUN_DIR/report by default.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Draw the map of a run with its matches, as PNG and SVG.
+
+    Example: geofleet report data/processed
+    """
+    from geofleet.steps import report as step
+
+    result = step.report(run_dir, out or run_dir / "report")
+    if as_json:
+        _print_json(asdict(result))
+    else:
+        _print_files(result.files)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="Folder to write.")] = Path("geofleet-demo"),
+    workers: Workers = N_CORES,
+    show: Annotated[bool, typer.Option("--show", help="Only print what a finished demo in --out has found.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run the main job on the shipped data: 50 simulated cars past real signs in Helsinki.
+
+    Example: geofleet demo --out geofleet-demo
+    """
+    from geofleet.workflows import demo as workflow
+
+    if not show:
+        with _progress("demo") as progress:
+            workflow.run_demo(out, n_workers=workers, progress=progress)
+    result = workflow.demo_result(out)
+    if as_json:
+        _print_json(asdict(result))
+        return
+    typer.echo(f"\n{result.caption}\n")
+    _print_scores(result.totals)
+    typer.echo("\nOpen in QGIS (drag the files in), or look at the picture:")
+    _print_files(result.files)
+
+
+@app.command()
+def sql(
+    query: Annotated[str, typer.Argument(help="A statement, or the path of a .sql file.")],
+    data: Annotated[Path, typer.Option("--data", help="Folder with tables.")] = Path("data/processed"),
+    as_json: AsJson = False,
+) -> None:
+    """Query the tables below a folder with DuckDB's spatial SQL; each table is a view of its name.
+
+    Example: geofleet sql "SELECT concept, count(*) AS n FROM signs GROUP BY concept ORDER BY n DESC"
+    """
+    from geofleet.workflows.query import query as workflow
+
+    names, rows = workflow(query, data)
+    if as_json:
+        _print_json([dict(zip(names, row, strict=True)) for row in rows])
+    else:
+        _print_table(names, rows)
+
+
+@app.command()
+def schema(
+    table: Annotated[str | None, typer.Argument(help="Name of a table; all names when left out.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print the schema of a table: columns with type, unit and meaning.
+
+    Example: geofleet schema detections
+    """
+    from geofleet.tables.schemas import SCHEMAS
+    from geofleet.tables.store import schema_named
+
+    if table is None:
+        rows = [(s.name, ", ".join(s.key), s.description) for s in SCHEMAS.values()]
+        names = ("table", "key", "description")
+    else:
+        found = schema_named(table)
+        names = ("column", "type", "null", "description")
+        rows = [(c.name, str(c.type), "null" if c.nullable else "", c.description) for c in found.all_columns] + [
+            ("geometry", f"{found.geometry}, WKB", "", "OGC:CRS84, longitude and latitude")
+        ] * bool(found.geometry)
+    if as_json:
+        _print_json([dict(zip(names, row, strict=True)) for row in rows])
+    else:
+        _print_table(names, rows)
+
+
+def _settle(scenario: str | Path, settings: list[str] | None, **options: Any) -> Config:
+    """Read the settings; options win over `--set`, which wins over the file."""
+    from geofleet.config import load_config
+
+    given = [f"{key}={json.dumps(value)}" for key, value in options.items() if value is not None]
+    return load_config(scenario, [*(settings or []), *given])
+
+
+@contextmanager
+def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Draw a progress bar on a terminal; elsewhere (CI, a pipe) say on standard error what is being done."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        sys.stderr.write(f"{label} ...\n")
+        yield lambda _done, _total: None
+        return
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task(label, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _report(result: Any, *, as_json: bool) -> None:
+    """Print the result of a step: one JSON object, or its sentences."""
+    if as_json:
+        _print_json(asdict(result))
+    else:
+        for line in result.summary():
+            typer.echo(line)
+
+
+def _print_json(value: Any) -> None:
+    typer.echo(json.dumps(value, indent=2, default=lambda v: asdict(v) if is_dataclass(v) else str(v)))
+
+
+def _print_scores(totals: tuple[dict[str, Any], ...]) -> None:
+    names = (
+        "run_id",
+        "method",
+        "n_vehicles",
+        "tp",
+        "fp",
+        "fn",
+        "precision",
+        "recall",
+        "f1",
+        "rmse_m",
+        "gospa",
+        "gospa_m",
+    )
+    _print_table(names, [tuple(total[name] for name in names) for total in totals])
+    for total in totals:
+        if total["null_reason"]:
+            typer.echo(f"{total['run_id'] or total['method']}: {total['null_reason']}")
+
+
+def _print_files(files: tuple[Path, ...]) -> None:
+    for path in files:
+        typer.echo(f"  {path}")
+
+
+def _print_table(names: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
+    """Print left-aligned text and right-aligned numbers, never cut to the width of the terminal."""
+    cells = [[f"{v:.4f}" if isinstance(v, float) else "" if v is None else str(v) for v in row] for row in rows]
+    widths = [max(len(name), *(len(row[i]) for row in cells)) if cells else len(name) for i, name in enumerate(names)]
+    right = [any(isinstance(row[i], int | float) for row in rows) for i in range(len(names))]
+    for row in [list(names), *cells]:
+        aligned = (c.rjust(w) if r else c.ljust(w) for c, w, r in zip(row, widths, right, strict=True))
+        typer.echo("  ".join(aligned).rstrip())
