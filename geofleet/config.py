@@ -154,11 +154,12 @@ def load_config(scenario: str | Path = ROOT_SCENARIO, overrides: Mapping[str, An
         raise ConfigError(*_explain(error, path)) from None
 
 
-def _find(scenario: str | Path) -> Path:
+def _find(scenario: str | Path, beside: Path | None = None) -> Path:
+    """Return the file of a scenario; a `base` is looked for beside the file that names it."""
     packaged = packaged_scenarios()
     if str(scenario) in packaged:
         return packaged[str(scenario)]
-    path = Path(scenario)
+    path = beside.parent / scenario if beside else Path(scenario)
     if path.suffix == ".toml" and path.is_file():
         return path
     raise ConfigError(
@@ -176,7 +177,9 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, dict[str, Any]]:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"not valid TOML: {error}.", where=str(path), todo="Mend the file.") from None
     base = own.pop("base", None if path == packaged_scenarios()[ROOT_SCENARIO] else ROOT_SCENARIO)
-    tree: dict[str, dict[str, Any]] = _read(_find(base), (*seen, path)) if base else {name: {} for name in SECTIONS}
+    tree: dict[str, dict[str, Any]] = (
+        _read(_find(base, beside=path), (*seen, path)) if base else {name: {} for name in SECTIONS}
+    )
     for section, keys in own.items():
         if section not in SECTIONS or not isinstance(keys, dict):
             raise ConfigError(

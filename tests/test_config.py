@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import tomllib
+from contextlib import suppress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from geofleet.config import SECTIONS, load_config, packaged_scenarios
+from geofleet.errors import ConfigError
+
+
+@pytest.mark.parametrize("name", sorted(packaged_scenarios()))
+def test_every_packaged_scenario_loads(name):
+    assert load_config(name).scenario == name
+
+
+def test_paper_names_every_key_so_that_defaults_live_in_one_place():
+    tree = tomllib.loads(packaged_scenarios()["paper"].read_text())
+    assert {name: set(keys) for name, keys in tree.items()} == {
+        name: set(section.model_fields) for name, section in SECTIONS.items()
+    }
+
+
+def test_key_names_are_unique_over_sections():
+    names = [key for section in SECTIONS.values() for key in section.model_fields]
+    assert len(names) == len(set(names))
+
+
+def test_overrides_with_and_without_section():
+    assert load_config("paper", ["range_m=50"]) == load_config("paper", {"sensor.range_m": 50})
+    assert load_config("paper", ["tracker=ideal"]).tracking.tracker == "ideal"
+
+
+def test_a_file_starts_from_paper(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("[sensor]\nrange_m = 80.0\n")
+    config = load_config(path)
+    assert (config.scenario, config.sensor.range_m) == ("mine", 80.0)
+    assert config.tracking == load_config("paper").tracking
+
+
+def test_digest_changes_with_what_it_covers_only():
+    paper, wide = load_config(), load_config("paper", ["eps_m=5.0"])
+    assert paper.digest("sensor") == wide.digest("sensor")
+    assert paper.digest("aggregate") != wide.digest("aggregate")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["rang_m=3"], r"unknown scenario key 'rang_m'\. Did you mean range_m"),
+        (["sensor.eps_m=3"], "unknown scenario key 'sensor.eps_m'"),
+        (["fov_deg=400"], r"sensor\.fov_deg: .*less than or equal to 360 \(got 400\)"),
+        (["gnss_sigma_m=-1"], r"sensor\.gnss_sigma_m"),
+        (["gnss_sigma_m=nan"], r"sensor\.gnss_sigma_m"),
+        (["false_negative_rate=1.2"], r"sensor\.false_negative_rate"),
+        (["tracker=magic"], r"tracking\.tracker"),
+        (["nothing"], "'nothing' is not key=value"),
+    ],
+)
+def test_bad_overrides_are_named(overrides, message):
+    with pytest.raises(ConfigError, match=message):
+        load_config("paper", overrides)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[sensors]\nrange_m = 1", "unknown section or key 'sensors'"),
+        ("range_m = 1", "unknown section or key 'range_m'"),
+        ("[sensor]\nrange = 1", r"mine\.toml: unknown scenario key 'sensor\.range'"),
+        ("[sensor", r"mine\.toml: not valid TOML"),
+        ("base = 'nowhere'", "unknown scenario 'nowhere'"),
+    ],
+)
+def test_bad_files_are_named(text, message, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_config(path)
+
+
+def test_files_that_start_from_each_other_are_refused(tmp_path):
+    a, b = tmp_path / "a.toml", tmp_path / "b.toml"
+    a.write_text(f"base = '{b}'")
+    b.write_text("base = 'a.toml'")
+    with pytest.raises(ConfigError, match="start from each other: a -> b -> a"):
+        load_config(a)
+
+
+@given(st.text(max_size=30))
+def test_no_override_text_is_a_traceback(text):
+    with suppress(ConfigError):
+        load_config("paper", [text])
