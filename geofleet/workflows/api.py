@@ -1,0 +1,151 @@
+"""The steps as functions of GeoDataFrames, under the names of the command line.
+
+Every frame is in OGC:CRS84 when it comes out and in any CRS when it goes in. A call runs the same step on the same tables
+as the command does, in a temporary folder, so both give the same numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from geofleet.config import load_config
+from geofleet.steps import aggregate as aggregate_step
+from geofleet.steps import evaluate as evaluate_step
+from geofleet.steps import ingest as ingest_step
+from geofleet.steps import simulate as simulate_step
+from geofleet.tables.schemas import DETECTIONS, DRIVES, PASSES, REFERENCE, SIGNS, TRUTH, Schema
+from geofleet.tables.store import from_geodataframe, read_table, to_geodataframe, write_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from geopandas import GeoDataFrame
+
+    from geofleet.algorithms.metrics import MapScore
+
+
+@dataclass(frozen=True, slots=True)
+class Simulation:
+    """What a simulated run leaves: the scene, where vehicles drove, what they sent, and where that came from."""
+
+    reference: GeoDataFrame
+    passes: GeoDataFrame
+    detections: GeoDataFrame
+    truth: pd.DataFrame
+
+
+def read_signs(path: str | Path, **options: Any) -> GeoDataFrame:
+    """Read the signs of any map that geofleet knows; options are those of `geofleet ingest signs`.
+
+    Raises
+    ------
+    InputError
+        The file is missing, empty or of an unknown format.
+    """
+    with TemporaryDirectory() as folder:
+        ingest_step.ingest_signs([Path(path)], Path(folder) / "signs.parquet", **options)
+        return _read(SIGNS, Path(folder) / "signs.parquet")
+
+
+def read_drive(path: str | Path) -> GeoDataFrame:
+    """Read a trajectory; options are those of `geofleet ingest drive`.
+
+    Raises
+    ------
+    InputError
+        The file is missing, empty or of an unknown format.
+    """
+    with TemporaryDirectory() as folder:
+        ingest_step.ingest_drive([Path(path)], Path(folder) / "drives.parquet")
+        return _read(DRIVES, Path(folder) / "drives.parquet")
+
+
+def simulate(
+    signs: GeoDataFrame,
+    drive: GeoDataFrame,
+    *,
+    scenario: str = "paper",
+    n_vehicles: int = 50,
+    seed: int = 0,
+    **overrides: Any,
+) -> Simulation:
+    """Simulate a fleet past signs; any key of a scenario may be overridden, e.g. `range_m=50`.
+
+    Raises
+    ------
+    ConfigError
+        The scenario or a key is unknown, or a value is out of range.
+    InputError
+        No signs stand near the drive, or the drive does not move.
+    """
+    config = load_config(scenario, overrides)
+    with TemporaryDirectory() as folder:
+        here = Path(folder)
+        write_table(SIGNS, from_geodataframe(SIGNS, signs), here / "signs.parquet")
+        write_table(DRIVES, from_geodataframe(DRIVES, drive), here / "drives.parquet")
+        out = here / "simulation"
+        simulate_step.simulate(
+            here / "signs.parquet", here / "drives.parquet", out, config=config, n_vehicles=n_vehicles, seed=seed
+        )
+        return Simulation(
+            _read(REFERENCE, out / "reference.parquet"),
+            _read(PASSES, out / "passes.parquet"),
+            _read(DETECTIONS, out / "detections"),
+            read_table(TRUTH, out / "truth").to_pandas(),
+        )
+
+
+def aggregate(
+    detections: GeoDataFrame,
+    *,
+    method: str = "dbscan",
+    semantic: str = "first",
+    n_vehicles: int | None = None,
+    **overrides: Any,
+) -> GeoDataFrame:
+    """Cluster detections and fuse them into a sign map; any key of a scenario may be overridden, e.g. `eps_m=3`.
+
+    Raises
+    ------
+    ConfigError
+        A key is unknown, or a value is out of range.
+    TableError
+        A column is missing or mistyped.
+    """
+    config = load_config(overrides={"method": method, "semantic": semantic, **overrides})
+    with TemporaryDirectory() as folder:
+        source, out = Path(folder) / "detections.parquet", Path(folder) / "fused.parquet"
+        write_table(DETECTIONS, from_geodataframe(DETECTIONS, detections), source)
+        aggregate_step.aggregate(source, out, config=config, n_vehicles=n_vehicles)
+        return _read(SIGNS, out)
+
+
+def score_map(
+    map_: GeoDataFrame, reference: GeoDataFrame, *, gate_m: float = 2.0, match_on: str = "class"
+) -> MapScore:
+    """Score the main signs of a map against a reference (paper, eq. GOSPA_M; DOI 10.23919/ICIF.2017.8009645).
+
+    Parameters
+    ----------
+    map_, reference
+        One map and its reference; frames that hold several runs are refused.
+    gate_m
+        c: a match is nearer than this.
+    match_on
+        What must be equal in a match: `class`, `concept` or `none`.
+
+    Raises
+    ------
+    ConfigError
+        A frame holds more than one run, or an option is out of range.
+    """
+    config = load_config(overrides={"gate_m": gate_m, "match_on": match_on})
+    return evaluate_step.score_layers(
+        from_geodataframe(SIGNS, map_), from_geodataframe(SIGNS, reference), config=config.evaluate
+    )
+
+
+def _read(schema: Schema, path: Path) -> GeoDataFrame:
+    return to_geodataframe(read_table(schema, path))
