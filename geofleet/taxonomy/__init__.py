@@ -1,1 +1,5 @@
-"""One vocabulary of traffic signs."""
+"""One vocabulary for the signs of every scheme: `taxonomy.csv` and its reader."""
+
+from geofleet.taxonomy.reader import Classified, Concept, Meaning, Taxonomy, load_taxonomy
+
+__all__ = ["Classified", "Concept", "Meaning", "Taxonomy", "load_taxonomy"]

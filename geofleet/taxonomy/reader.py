@@ -1,0 +1,209 @@
+"""Reads `taxonomy.csv`: what every code of every scheme means, in one vocabulary.
+
+A row ties a code pattern of one scheme to a concept. `code_pattern` is a regular expression that must match the whole
+code, letters of either case, `{n}` standing for a number. The code is tried with its bracket first and without it
+next. `value_rule` says where the number on the sign comes from: empty, none; `number`, from `{n}`, or else from the
+bracket; `=30`, always that. The first row that matches wins.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+RAW_PREFIX = "raw:"
+OTHER_GROUP = "other"
+NUMBER = r"(?P<value>\d+(?:[.,]\d+)?)"
+_IN_BRACKET = re.compile(r"(?<![\w:])(\d+(?:[.,]\d+)?)\s*(km/h|mph|t|m|%)?(?![\w.:-])")
+_LANELET2 = re.compile(r"([a-z]{2})([A-Z]*\d.*)")
+_MAPILLARY_VARIANT = re.compile(r"--g\d+$")
+
+
+@dataclass(frozen=True, slots=True)
+class Concept:
+    """What a sign means: its name, group, kind and the unit of its number."""
+
+    name: str
+    group: str
+    kind: str
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """One code understood: concept, group, kind, value with unit, class; `known` is false for raw codes."""
+
+    concept: str
+    group: str
+    kind: str
+    value: float | None
+    unit: str | None
+    sign_class: str
+    known: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Classified:
+    """Meanings of many codes as columns of the `signs` table, in the order of the codes.
+
+    `value` is NaN and `unit` None where a sign carries no number.
+    """
+
+    concept: NDArray[np.object_]
+    group: NDArray[np.object_]
+    kind: NDArray[np.object_]
+    value: NDArray[np.float64]
+    unit: NDArray[np.object_]
+    sign_class: NDArray[np.object_]
+    known: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class _Rule:
+    concept: Concept
+    pattern: re.Pattern[str]
+    value_rule: str
+    unit: str
+    scheme: str
+    country: str
+
+
+@dataclass(frozen=True)
+class Taxonomy:
+    """The vocabulary: concepts by name, and the rules that lead from codes to them."""
+
+    concepts: dict[str, Concept]
+    rules: tuple[_Rule, ...]
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of all groups, sorted."""
+        return tuple(sorted({concept.group for concept in self.concepts.values()}))
+
+    def classify(
+        self, codes: Sequence[str], *, country: str | Sequence[str | None] | None = None, scheme: str | None = None
+    ) -> Classified:
+        """Return what codes mean; each distinct code is looked at once.
+
+        Parameters
+        ----------
+        codes
+            Codes as their source has them, without country: `274.1[30]`, `regulatory--stop--g1`, `give_way`.
+        country
+            ISO 3166-1 alpha-2, one for all codes or one each: its national code, then OpenStreetMap's words.
+        scheme
+            `mapillary`, `lanelet2`, `opendrive`, `vienna`, `osm` or a national scheme: that scheme only. Codes of
+            `lanelet2` may name their country themselves (`de274_1`).
+        """
+        lands = [country] * len(codes) if country is None or isinstance(country, str) else list(country)
+        found = [_meaning(code, land or "", scheme or "") for code, land in zip(codes, lands, strict=True)]
+        return Classified(
+            *(np.array([getattr(m, name) for m in found], object) for name in ("concept", "group", "kind")),
+            value=np.array([np.nan if m.value is None else m.value for m in found], np.float64),
+            unit=np.array([m.unit for m in found], object),
+            sign_class=np.array([m.sign_class for m in found], object),
+            known=np.array([m.known for m in found], bool),
+        )
+
+    def meaning(self, code: str, *, country: str = "", scheme: str = "") -> Meaning:
+        """Return what one code means; an unknown one is its own concept, `raw:<code>`, of kind `main`."""
+        return _meaning(code, country, scheme)
+
+    def group_of(self, concepts: Sequence[str]) -> NDArray[np.object_]:
+        """Return the group of each concept; raw and unknown concepts belong to `other`."""
+        return np.array(
+            [self.concepts[c].group if c in self.concepts else OTHER_GROUP for c in concepts], dtype=object
+        )
+
+    def kind_of(self, concepts: Sequence[str]) -> NDArray[np.object_]:
+        """Return the kind of each concept; raw and unknown concepts are `main`."""
+        return np.array([self.concepts[c].kind if c in self.concepts else "main" for c in concepts], dtype=object)
+
+
+@cache
+def load_taxonomy() -> Taxonomy:
+    """Read the packaged vocabulary, once."""
+    text = resources.files("geofleet.taxonomy").joinpath("taxonomy.csv").read_text(encoding="utf-8")
+    concepts: dict[str, Concept] = {}
+    rules = []
+    for row in csv.DictReader(text.splitlines()):
+        concept = concepts.setdefault(
+            row["concept"], Concept(row["concept"], row["group"], row["kind"], row["unit"])
+        )
+        pattern = re.compile(row["code_pattern"].replace("{n}", NUMBER, 1).replace("{n}", r"\d+"), re.IGNORECASE)
+        rules.append(_Rule(concept, pattern, row["value_rule"], row["unit"], row["scheme"], row["country"]))
+    return Taxonomy(concepts, tuple(rules))
+
+
+@lru_cache(maxsize=65536)
+def _meaning(code: str, country: str, scheme: str) -> Meaning:
+    text, land = _normalised(code.strip(), country.upper(), scheme)
+    for rule in _rules_for(land, scheme):
+        for candidate in dict.fromkeys((text, _without_bracket(text))):
+            match = rule.pattern.fullmatch(candidate)
+            if match:
+                return _understood(rule, match, text)
+    raw = RAW_PREFIX + code.strip()
+    return Meaning(raw, OTHER_GROUP, "main", None, None, raw, known=False)
+
+
+@cache
+def _rules_for(country: str, scheme: str) -> tuple[_Rule, ...]:
+    """Return the rules to try, in order: one scheme; or a country's, then OpenStreetMap's words."""
+    rules = load_taxonomy().rules
+    words = tuple(rule for rule in rules if rule.scheme == "osm")
+    if scheme and scheme != "lanelet2":
+        return tuple(rule for rule in rules if rule.scheme == scheme)
+    national = tuple(rule for rule in rules if rule.country == country) if country else ()
+    if scheme:
+        return (*(rule for rule in rules if rule.scheme == scheme), *national, *words)
+    return (*national, *words)
+
+
+def _normalised(code: str, country: str, scheme: str) -> tuple[str, str]:
+    if scheme == "mapillary":
+        return _MAPILLARY_VARIANT.sub("", code), country
+    match = _LANELET2.fullmatch(code) if scheme == "lanelet2" else None
+    if match:
+        return match[2].replace("_", "."), match[1].upper()
+    return code, country
+
+
+def _without_bracket(code: str) -> str:
+    """Return the code before its first bracket, where brackets may be round."""
+    return re.split(r"\s*[\[(]", code, maxsplit=1)[0].rstrip(" _")
+
+
+def _understood(rule: _Rule, match: re.Match[str], code: str) -> Meaning:
+    value, unit = _value(rule, match, code)
+    concept = rule.concept
+    sign_class = concept.name
+    if value is not None:
+        sign_class += f":{value:g}" + ("" if unit in (None, concept.unit) else str(unit))
+    return Meaning(concept.name, concept.group, concept.kind, value, unit, sign_class, known=True)
+
+
+def _value(rule: _Rule, match: re.Match[str], code: str) -> tuple[float | None, str | None]:
+    """Return the number on the sign and its unit, by the rule of the row."""
+    if rule.value_rule.startswith("="):
+        return float(rule.value_rule[1:]), rule.unit
+    if rule.value_rule != "number":
+        return None, None
+    own: Any = match.groupdict().get("value")
+    if own:
+        return float(own.replace(",", ".")), rule.unit
+    bracket = re.search(r"[\[(](.*)[\])]?", code)
+    found = _IN_BRACKET.search(bracket[1].rstrip("])")) if bracket else None
+    if not found:
+        return None, None
+    return float(found[1].replace(",", ".")), found[2] or rule.unit
