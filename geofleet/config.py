@@ -42,10 +42,12 @@ class FleetConfig(_Section):
     """How vehicles follow the drive."""
 
     frame_spacing_m: Positive
+    heading_baseline_m: Positive
     speed_mps: Positive
     lateral_sigma_m: NonNegative
     lateral_correlation_m: Positive
     speed_factor_sigma: NonNegative
+    headway_s: NonNegative
 
 
 class SensorConfig(_Section):

@@ -1,0 +1,302 @@
+"""What a camera reports frame by frame: the paper's "Detection Simulation", one function an equation.
+
+The chain of a pass is `in_view_of` → `keep_detected` → `measured` → `recognised`, with `ghosts` beside it and
+`projected` at the end; `sense_pass` runs it. Positions are metres in an ENU frame, headings and bearings
+counter-clockwise (a bearing is positive to the left), angles of the model in degrees as in the configuration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from geofleet.algorithms.sensing_kernels import in_view
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    from geofleet.algorithms.streams import PassStreams
+    from geofleet.algorithms.trajectory import Poses
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+    Flags = NDArray[np.bool_]
+
+GHOST = -1
+"""Stands for the sign of a detection that came from none."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorModel:
+    """What a sensor sees and how wrong it is; every sigma is that of a zero-mean normal distribution.
+
+    Parameters
+    ----------
+    range_m, fov_deg
+        The view cone: distance below `range_m` and |bearing| below half of the full angle `fov_deg`.
+    gnss_sigma_m
+        Offset of the reported position, a axis and pass.
+    heading_sigma_deg
+        Offset of the reported heading, a pass.
+    range_bias_sigma_m, bearing_bias_sigma_deg
+        Sensor-setting error, once a sensor.
+    range_noise_sigma_m, bearing_noise_sigma_deg
+        Measurement noise, once a frame and object.
+    false_negative_rate
+        Probability that a sign in view is missed, a frame.
+    semantic_rate
+        Probability that a class is recognised.
+    semantic_draw
+        Recognition is drawn once a sign and pass (`track`), or anew for every frame (`frame`).
+    ghost_rate_per_ha
+        Expected false positives a frame and hectare of the view cone.
+    """
+
+    range_m: float
+    fov_deg: float
+    gnss_sigma_m: float = 0.0
+    heading_sigma_deg: float = 0.0
+    range_bias_sigma_m: float = 0.0
+    bearing_bias_sigma_deg: float = 0.0
+    range_noise_sigma_m: float = 0.0
+    bearing_noise_sigma_deg: float = 0.0
+    false_negative_rate: float = 0.0
+    semantic_rate: float = 1.0
+    semantic_draw: Literal["track", "frame"] = "track"
+    ghost_rate_per_ha: float = 0.0
+
+    @property
+    def half_fov_rad(self) -> float:
+        """Half of the opening angle of the view cone."""
+        return float(np.deg2rad(self.fov_deg)) / 2
+
+    @property
+    def cone_area_m2(self) -> float:
+        """Area of the view cone, ½ r² FOV (paper, "False Positives and False Negatives")."""
+        return self.range_m**2 * self.half_fov_rad
+
+    @property
+    def ghosts_per_frame(self) -> float:
+        """λ = FP_rate · A (paper, ibid.), with the rate a hectare."""
+        return self.ghost_rate_per_ha * self.cone_area_m2 / 1e4
+
+
+class SignField:
+    """The signs of a scene, in a grid of cells as wide as the sensor sees.
+
+    Parameters
+    ----------
+    xy_m
+        East and north, shape (n, 2).
+    class_code
+        Class of each sign, 0 … n_classes - 1, shape (n,).
+    n_classes
+        How many classes are valid in the scene.
+    cell_m
+        Width of a cell; `SensorModel.range_m` of the sensors that look at the field may not exceed it.
+    """
+
+    def __init__(self, xy_m: Floats, class_code: Ints, *, n_classes: int, cell_m: float) -> None:
+        self.xy_m = np.ascontiguousarray(xy_m, dtype=np.float64)
+        self.class_code = np.ascontiguousarray(class_code, dtype=np.int64)
+        self.n_classes = n_classes
+        self.cell_m = cell_m
+        self.origin_xy_m = self.xy_m.min(axis=0)
+        column, row = np.floor((self.xy_m - self.origin_xy_m) / cell_m).astype(np.int64).T
+        self.shape = (int(row.max()) + 1, int(column.max()) + 1)
+        cell = row * self.shape[1] + column
+        self.cell_sign = np.argsort(cell, kind="stable")
+        self.cell_start = np.searchsorted(cell[self.cell_sign], np.arange(self.shape[0] * self.shape[1] + 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """Signs in the view cone, or what was measured of them, one row a frame and object, by frame.
+
+    Parameters
+    ----------
+    frame, sign
+        Number of the frame and of the sign (`GHOST` for none), shape (n,).
+    range_m, bearing_rad
+        Distance and angle from the heading, positive to the left, shape (n,).
+    """
+
+    frame: Ints
+    sign: Ints
+    range_m: Floats
+    bearing_rad: Floats
+
+    def take(self, rows: Ints | Flags) -> Sightings:
+        """Return some rows, by number or by flag."""
+        return Sightings(self.frame[rows], self.sign[rows], self.range_m[rows], self.bearing_rad[rows])
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Sensor-setting error of one sensor: what it adds to every range and bearing."""
+
+    range_bias_m: float
+    bearing_bias_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class FrameDetections:
+    """What a pass detects, one row a frame and object, by frame.
+
+    Parameters
+    ----------
+    frame, sign, class_code
+        Number of the frame, of the true sign (`GHOST` for none) and of the reported class, shape (n,).
+    xy_m
+        Reported position, shape (n, 2).
+    range_m, azimuth_rad
+        Measured range, and reported direction of view counter-clockwise from east, shape (n,).
+    n_frames
+        Frames of the pass, with and without detections.
+    """
+
+    frame: Ints
+    sign: Ints
+    class_code: Ints
+    xy_m: Floats
+    range_m: Floats
+    azimuth_rad: Floats
+    n_frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class PassSensing:
+    """What a pass sees: the signs truly in view, what it detects, and where it says it was."""
+
+    in_view: Sightings
+    detections: FrameDetections
+    reported: Poses
+
+
+def in_view_of(poses: Poses, signs: SignField, model: SensorModel) -> Sightings:
+    """Return the signs in the view cone: d < r and |θ| < FOV/2, both strict, from the true pose (paper, eq. 1)."""
+    if model.range_m > signs.cell_m:
+        raise ValueError(f"a sensor of {model.range_m} m range needs cells as wide, not {signs.cell_m} m")
+    return Sightings(
+        *in_view(
+            poses.xy_m,
+            poses.heading_rad,
+            signs.xy_m,
+            signs.cell_start,
+            signs.cell_sign,
+            signs.origin_xy_m,
+            signs.shape,
+            model.range_m,
+            model.half_fov_rad,
+        )
+    )
+
+
+def draw_calibration(model: SensorModel, rng: Generator) -> Calibration:
+    """Draw the sensor-setting error, ε_sensor ~ N(0, sigma_sensor²) in range and in bearing (paper, eq. 2)."""
+    range_unit, bearing_unit = rng.standard_normal(2)
+    return Calibration(
+        float(model.range_bias_sigma_m * range_unit),
+        float(np.deg2rad(model.bearing_bias_sigma_deg) * bearing_unit),
+    )
+
+
+def reported_poses(true: Poses, model: SensorModel, rng: Generator) -> Poses:
+    """Return the poses that the vehicle believes: one offset a axis and one heading error for the whole pass."""
+    east_unit, north_unit, heading_unit = rng.standard_normal(3)
+    offset_m = model.gnss_sigma_m * np.array([east_unit, north_unit])
+    turn_rad = np.deg2rad(model.heading_sigma_deg) * heading_unit
+    return type(true)(true.xy_m + offset_m, true.heading_rad + turn_rad, true.along_m)
+
+
+def keep_detected(n: int, false_negative_rate: float, rng: Generator) -> Flags:
+    """Draw which of n signs in view are detected: each is missed with probability FN, independently."""
+    return rng.random(n) >= false_negative_rate
+
+
+def measured(true: Sightings, calibration: Calibration, model: SensorModel, rng: Generator) -> Sightings:
+    """Add both levels of error: d + ε_sensor + ε_object, and the same for θ (paper, eqs. 3-5).
+
+    A range may come out negative when sigma is as large as the distance; the paper does not cut it, nor do we.
+    """
+    n = len(true.frame)
+    range_m = true.range_m + calibration.range_bias_m + model.range_noise_sigma_m * rng.standard_normal(n)
+    noise_rad = np.deg2rad(model.bearing_noise_sigma_deg) * rng.standard_normal(n)
+    bearing_rad = true.bearing_rad + calibration.bearing_bias_rad + noise_rad
+    return Sightings(true.frame, true.sign, range_m, bearing_rad)
+
+
+def recognised(true_class: Ints, *, n_classes: int, semantic_rate: float, rng: Generator) -> Ints:
+    """Recognise classes (paper, Algorithm 1): keep with probability r_semantic, else a random other valid class.
+
+    Raises
+    ------
+    ValueError
+        A class would have to be confused, but there is only one.
+    """
+    correct = rng.random(len(true_class)) < semantic_rate
+    if n_classes == 1:
+        if semantic_rate < 1:
+            raise ValueError("one class alone cannot be confused: semantic_rate must be 1")
+        return true_class
+    other = rng.integers(0, n_classes - 1, len(true_class))
+    other += other >= true_class  # skip the true one
+    return np.where(correct, true_class, other)
+
+
+def ghosts(n_frames: int, *, n_classes: int, model: SensorModel, rng: Generator) -> tuple[Sightings, Ints]:
+    """Draw false positives: N ~ Poisson(λ) a frame, uniform over the view cone, with a random valid class each."""
+    count = rng.poisson(model.ghosts_per_frame, n_frames)
+    frame = np.repeat(np.arange(n_frames), count)
+    n = len(frame)
+    range_m = model.range_m * np.sqrt(rng.random(n))  # area grows with the square of the radius
+    bearing_rad = model.half_fov_rad * (2 * rng.random(n) - 1)
+    class_code = rng.integers(0, n_classes, n)
+    return Sightings(frame, np.full(n, GHOST), range_m, bearing_rad), class_code
+
+
+def projected(seen: Sightings, reported: Poses) -> tuple[Floats, Floats]:
+    """Return reported positions p = pose + R(heading) d (cos θ, sin θ) (paper, eq. 6), and directions of view."""
+    azimuth_rad = reported.heading_rad[seen.frame] + seen.bearing_rad
+    ray = np.column_stack((np.cos(azimuth_rad), np.sin(azimuth_rad)))
+    return reported.xy_m[seen.frame] + seen.range_m[:, None] * ray, azimuth_rad
+
+
+def sense_pass(true: Poses, signs: SignField, model: SensorModel, streams: PassStreams) -> PassSensing:
+    """Simulate what one pass over true poses detects, frame by frame."""
+    n_frames = len(true.heading_rad)
+    visible = in_view_of(true, signs, model)
+    reported = reported_poses(true, model, streams.pose)
+    kept = keep_detected(len(visible.frame), model.false_negative_rate, streams.frames)
+    calibration = draw_calibration(model, streams.calibration)
+    seen = measured(visible.take(kept), calibration, model, streams.frames)
+    class_code = _classes_seen(seen, signs, model, streams.classes)
+    ghost, ghost_class = ghosts(n_frames, n_classes=signs.n_classes, model=model, rng=streams.ghosts)
+    if len(ghost_class):
+        seen, class_code = _merged(seen, class_code, ghost, ghost_class)
+    xy_m, azimuth_rad = projected(seen, reported)
+    detections = FrameDetections(seen.frame, seen.sign, class_code, xy_m, seen.range_m, azimuth_rad, n_frames)
+    return PassSensing(visible, detections, reported)
+
+
+def _classes_seen(seen: Sightings, signs: SignField, model: SensorModel, rng: Generator) -> Ints:
+    """Return the reported class of each row, drawn once a sign and pass or for every frame."""
+    per_frame = model.semantic_draw == "frame"
+    true_class = signs.class_code[seen.sign] if per_frame else signs.class_code
+    drawn = recognised(true_class, n_classes=signs.n_classes, semantic_rate=model.semantic_rate, rng=rng)
+    return drawn if per_frame else drawn[seen.sign]
+
+
+def _merged(seen: Sightings, class_code: Ints, ghost: Sightings, ghost_class: Ints) -> tuple[Sightings, Ints]:
+    """Return signs and ghosts together, by frame, signs first within a frame."""
+    order = np.argsort(np.concatenate((seen.frame, ghost.frame)), kind="stable")
+    both = Sightings(
+        np.concatenate((seen.frame, ghost.frame)),
+        np.concatenate((seen.sign, ghost.sign)),
+        np.concatenate((seen.range_m, ghost.range_m)),
+        np.concatenate((seen.bearing_rad, ghost.bearing_rad)),
+    )
+    return both.take(order), np.concatenate((class_code, ghost_class))[order]

@@ -1,0 +1,160 @@
+"""Frames to tracks: the vehicle's own fusion over a pass (paper, "Temporal Tracking and Fusion").
+
+Two trackers give every frame detection a track, `track_paper` and `track_ideal`; `summarise` turns tracks into what
+the vehicle sends. Positions are metres in an ENU frame, angles counter-clockwise from east.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from geofleet.algorithms.sensing import GHOST
+from geofleet.algorithms.tracking_kernels import associate, majority, moments
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from geofleet.algorithms.sensing import FrameDetections
+    from geofleet.algorithms.trajectory import Poses
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerModel:
+    """How frames become tracks.
+
+    Parameters
+    ----------
+    tracker
+        `paper`: exact Hungarian assignment from frame to frame; `ideal`: one track a sign and pass.
+    track_gate_m
+        A detection joins a track only when nearer than this to its reference position (strictly).
+    track_reference
+        Reference position: that of the last detection, or the mean of all so far.
+    max_missed_frames
+        A track ends when it was not seen in more frames than this in a row.
+    min_track_frames
+        Shorter tracks are not sent.
+    end_on_leaving_view
+        A track not seen in a frame ends when its reference position is outside the view cone of the reported pose.
+    range_m, half_fov_rad
+        The view cone.
+    """
+
+    tracker: Literal["paper", "ideal"]
+    track_gate_m: float
+    track_reference: Literal["last", "mean"]
+    max_missed_frames: int
+    min_track_frames: int
+    end_on_leaving_view: bool
+    range_m: float
+    half_fov_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """What a pass sends, one row a track in the order of birth, and (`sign`) where it came from.
+
+    Parameters
+    ----------
+    xy_m
+        Mean position, shape (n, 2).
+    sigma_e_m, sigma_n_m, cov_en_m2
+        Spread over frames with F - 1 in the denominator; NaN when F = 1.
+    n_frames, frame_first, frame_last
+        F, and the frames of the first and the last detection.
+    range_mean_m, azimuth_rad
+        Mean measured range, and mean direction of view.
+    class_code, class_confidence
+        Class by vote over frames (of equals, the smallest code), and the winner's share of the votes.
+    sign
+        The sign that most frames came from, `GHOST` when none: truth, never sent.
+    """
+
+    xy_m: Floats
+    sigma_e_m: Floats
+    sigma_n_m: Floats
+    cov_en_m2: Floats
+    n_frames: Ints
+    frame_first: Ints
+    frame_last: Ints
+    range_mean_m: Floats
+    azimuth_rad: Floats
+    class_code: Ints
+    class_confidence: Floats
+    sign: Ints
+
+
+def track_pass(seen: FrameDetections, reported: Poses, model: TrackerModel) -> Tracks:
+    """Track the detections of a pass and return what is sent: tracks of at least `min_track_frames` frames."""
+    track = track_ideal(seen) if model.tracker == "ideal" else track_paper(seen, reported, model)
+    return summarise(seen, track, min_track_frames=model.min_track_frames)
+
+
+def track_paper(seen: FrameDetections, reported: Poses, model: TrackerModel) -> Ints:
+    """Return the track of every detection by frame-to-frame association, numbered by birth.
+
+    In each frame, detections and live tracks are assigned one to one so that as many pairs as possible are nearer
+    than the gate and, of those assignments, the total ENU distance is least: the Hungarian algorithm, exactly.
+    """
+    frame_start = np.searchsorted(seen.frame, np.arange(seen.n_frames + 1))
+    track: Ints = associate(
+        frame_start,
+        seen.xy_m,
+        reported.xy_m,
+        reported.heading_rad,
+        model.track_gate_m,
+        model.max_missed_frames,
+        model.track_reference == "mean",
+        model.end_on_leaving_view,
+        model.range_m,
+        model.half_fov_rad,
+    )
+    return track
+
+
+def track_ideal(seen: FrameDetections) -> Ints:
+    """Return the track of every detection with identities known: one a sign, one a ghost, numbered by birth."""
+    is_ghost = seen.sign == GHOST
+    identity = np.where(is_ghost, -1 - np.arange(len(seen.sign)), seen.sign)
+    _, first, inverse = np.unique(identity, return_index=True, return_inverse=True)
+    birth_order = np.empty(len(first), dtype=np.int64)
+    birth_order[np.argsort(first)] = np.arange(len(first))
+    return birth_order[inverse]
+
+
+def summarise(seen: FrameDetections, track: Ints, *, min_track_frames: int) -> Tracks:
+    """Return mean position p = Σ p_f / F, spread √(Σ (p_f - p̄)² / (F - 1)), times and class of each track."""
+    n_tracks = int(track.max()) + 1 if len(track) else 0
+    count, mean, scatter = moments(track, seen.xy_m, n_tracks)
+    sent = np.flatnonzero(count >= min_track_frames)
+    class_code, votes = majority(track, seen.class_code, n_tracks)
+    after_last = np.iinfo(np.int64).max  # of equals a sign wins over "ghost"
+    sign, _ = majority(track, np.where(seen.sign == GHOST, after_last, seen.sign), n_tracks)
+    first = np.full(n_tracks, -1)
+    first[track[::-1]] = seen.frame[::-1]
+    last = np.full(n_tracks, -1)
+    last[track] = seen.frame
+    ray_x = np.bincount(track, np.cos(seen.azimuth_rad), n_tracks)
+    ray_y = np.bincount(track, np.sin(seen.azimuth_rad), n_tracks)
+    freedom = np.where(count > 1, count - 1.0, np.nan)[:, None]
+    var_e, var_n, cov_en = (scatter / freedom)[sent].T
+    return Tracks(
+        xy_m=mean[sent],
+        sigma_e_m=np.sqrt(var_e),
+        sigma_n_m=np.sqrt(var_n),
+        cov_en_m2=cov_en,
+        n_frames=count[sent],
+        frame_first=first[sent],
+        frame_last=last[sent],
+        range_mean_m=(np.bincount(track, seen.range_m, n_tracks) / count)[sent],
+        azimuth_rad=np.arctan2(ray_y, ray_x)[sent],
+        class_code=class_code[sent],
+        class_confidence=(votes / count)[sent],
+        sign=np.where(sign == after_last, GHOST, sign)[sent],
+    )

@@ -1,0 +1,165 @@
+"""Drives to poses: a recorded line resampled at the frame rate, and the way that one pass takes along it.
+
+Everything is in an ENU frame in metres; headings are mathematical, counter-clockwise from east, in radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from geofleet.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+MOVING_STEP_M = 0.5
+"""Epochs nearer than this to the last one kept are standing still: their noise is no motion and has no heading."""
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Where a vehicle is at each frame.
+
+    Parameters
+    ----------
+    xy_m
+        East and north, shape (n, 2).
+    heading_rad
+        Driving direction, counter-clockwise from east, shape (n,).
+    along_m
+        Distance driven since the start of the drive, gaps included, shape (n,).
+    """
+
+    xy_m: Floats
+    heading_rad: Floats
+    along_m: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class DriveLine:
+    """The moving part of a drive.
+
+    Parameters
+    ----------
+    xy_m
+        East and north, shape (n, 2); at least two points a segment.
+    along_m
+        Distance from the first point, gaps included, shape (n,).
+    starts
+        Index of the first point of each segment and, last, the number of points.
+    """
+
+    xy_m: Floats
+    along_m: Floats
+    starts: Ints
+
+
+def drive_line(xy_m: Floats, segment: Ints) -> DriveLine:
+    """Drop the epochs that stand still and the segments that never move.
+
+    Parameters
+    ----------
+    xy_m
+        East and north of every epoch, shape (n, 2), in the order driven.
+    segment
+        Segment number of every epoch, shape (n,); a gap starts a new one.
+
+    Raises
+    ------
+    InputError
+        Fewer than two epochs remain, so that nothing has a heading.
+    """
+    if not np.isfinite(xy_m).all():
+        raise InputError(
+            "the drive has positions that are not finite numbers.", todo="Remove those epochs and ingest again."
+        )
+    kept = _moving(np.ascontiguousarray(xy_m), segment, MOVING_STEP_M)
+    points, part = xy_m[kept], segment[kept]
+    lonely = np.ones(len(points), dtype=np.bool_)
+    same = part[1:] == part[:-1]
+    lonely[1:] &= ~same
+    lonely[:-1] &= ~same
+    points, part = points[~lonely], part[~lonely]
+    if len(points) < 2:  # noqa: PLR2004 - a heading needs two points
+        raise InputError(
+            f"the drive of {len(xy_m)} epochs has no motion: no two of a segment are {MOVING_STEP_M} m apart.",
+            todo="Give a drive that moves.",
+        )
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    starts = np.concatenate(([0], np.flatnonzero(np.diff(part)) + 1, [len(points)]))
+    return DriveLine(points, np.concatenate(([0.0], np.cumsum(steps))), starts.astype(np.int64))
+
+
+def resample(line: DriveLine, *, spacing_m: float, heading_baseline_m: float) -> Poses:
+    """Place a frame every `spacing_m` of each segment, with the heading of its motion.
+
+    The heading is that of the chord over `heading_baseline_m` around the frame, which equals the heading of the line
+    smoothed by a moving average of that length: corners turn smoothly and centimetres of noise turn nothing. At the
+    ends of a segment the chord is shorter.
+
+    Raises
+    ------
+    InputError
+        The drive is shorter than one frame spacing.
+    """
+    spans = list(zip(line.along_m[line.starts[:-1]], line.along_m[line.starts[1:] - 1], strict=True))
+    pieces = [np.arange(first, last + 1e-9, spacing_m) for first, last in spans]
+    along = np.concatenate(pieces)
+    if len(along) < 2:  # noqa: PLR2004 - one frame is no drive
+        raise InputError(
+            f"the drive moves {line.along_m[-1]:.2f} m, less than one frame spacing of {spacing_m} m.",
+            todo="Give a longer drive, or set frame_spacing_m lower.",
+        )
+    low, high = np.repeat(np.array(spans), [len(piece) for piece in pieces], axis=0).T
+    behind = _at(line, np.maximum(along - heading_baseline_m / 2, low))
+    ahead = _at(line, np.minimum(along + heading_baseline_m / 2, high))
+    chord = ahead - behind
+    return Poses(_at(line, along), np.arctan2(chord[:, 1], chord[:, 0]), along)
+
+
+def wander(base: Poses, *, sigma_m: float, correlation_m: float, spacing_m: float, rng: Generator) -> Poses:
+    """Return the way of one pass: the base drive with a smooth lateral offset.
+
+    The offset is a stationary Gaussian process along the drive, N(0, sigma_m²) everywhere, with correlation
+    exp(-Δ² / (2 correlation_m²)) at distance Δ: white noise smoothed by a Gaussian kernel. Positive is left. The
+    heading follows the offset line.
+    """
+    if sigma_m == 0:
+        return base
+    width = correlation_m / np.sqrt(2) / spacing_m  # in frames; smoothing twice widens by the root of two
+    reach = int(np.ceil(4 * width))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    kernel *= sigma_m / np.linalg.norm(kernel)
+    noise = rng.standard_normal(len(base.heading_rad) + 2 * reach)
+    offset = np.convolve(noise, kernel, mode="valid")
+    slope = np.gradient(offset, spacing_m)
+    left = np.column_stack((-np.sin(base.heading_rad), np.cos(base.heading_rad)))
+    return Poses(base.xy_m + offset[:, None] * left, base.heading_rad + np.arctan(slope), base.along_m)
+
+
+def _at(line: DriveLine, along_m: Floats) -> Floats:
+    """Return the points of a line at some distances, shape (n, 2)."""
+    return np.column_stack([np.interp(along_m, line.along_m, line.xy_m[:, axis]) for axis in (0, 1)])
+
+
+@njit(cache=True)
+def _moving(xy_m: Floats, segment: Ints, step_m: float) -> Ints:
+    """Return the epochs to keep: the first of a segment, and each that is a step away from the last one kept."""
+    kept = np.empty(len(xy_m), dtype=np.int64)
+    n_kept = 0
+    for i in range(len(xy_m)):
+        if n_kept and segment[i] == segment[kept[n_kept - 1]]:
+            last = kept[n_kept - 1]
+            if np.hypot(xy_m[i, 0] - xy_m[last, 0], xy_m[i, 1] - xy_m[last, 1]) < step_m:
+                continue
+        kept[n_kept] = i
+        n_kept += 1
+    return kept[:n_kept]
