@@ -332,12 +332,19 @@ def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def _report(result: Any, *, as_json: bool) -> None:
-    """Print the result of a step: one JSON object, or its sentences."""
+    """Print the result of a step: one JSON object, or a line a field; fields that are empty are left out."""
+    fields = asdict(result)
     if as_json:
-        _print_json(asdict(result))
-    else:
-        for line in result.summary():
-            typer.echo(line)
+        _print_json(fields)
+        return
+    width = max(map(len, fields))
+    for name, value in fields.items():
+        if isinstance(value, dict):
+            value = ", ".join(f"{key}: {number}" for key, number in value.items())  # noqa: PLW2901 (shown as text)
+        elif isinstance(value, list | tuple):
+            value = ", ".join(map(str, value))  # noqa: PLW2901 (shown as text)
+        if value not in ("", None):
+            typer.echo(f"  {name.ljust(width)}  {value}")
 
 
 def _print_json(value: Any) -> None:

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 
 from geofleet.algorithms.geodesy import to_ecef
 from geofleet.algorithms.matching import Matching, match_points
-from geofleet.algorithms.metrics import derive_scores, null_reason
+from geofleet.algorithms.metrics import MapScore, derive_scores, null_reason
 from geofleet.algorithms.tiling import quadkey_bounds, quadkeys
 from geofleet.errors import ConfigError
 from geofleet.formats.geojson import write_geojson
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from geopandas import GeoDataFrame
 
-    from geofleet.config import Config
+    from geofleet.config import Config, EvaluateConfig
 
 _REQUIREMENT = re.compile(r"^\s*([a-z_0-9]+)\s*(<=|>=|<|>|==)\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*$")
 _SHORTEST_LINE_M = 0.002  # GeoJSON is written to a millimetre: anything shorter could come out without length
@@ -96,6 +96,31 @@ def evaluate(map_path: Path, reference_path: Path, out: Path, *, config: Config)
         counts={"matches": matches.num_rows, "scores": scores.num_rows},
     )
     return EvaluateResult(out, totals, tuple(out / name for name in names))
+
+
+def score_layers(map_: pa.Table, reference: pa.Table, *, config: EvaluateConfig) -> MapScore:
+    """Score the main signs of one map against those of one reference, both `signs` tables.
+
+    Raises
+    ------
+    ConfigError
+        A layer holds more than one run, method or fleet size.
+    """
+    for name, layer in (("map", map_), ("reference", reference)):
+        n_groups = _labels(layer).group_by(["run_id", "method", "n_vehicles"]).aggregate([]).num_rows
+        if n_groups > 1:
+            raise ConfigError(f"the {name} holds {n_groups} runs, methods or fleet sizes.", todo="Score one at a time.")
+    fused, ref = _main_signs(map_), _main_signs(reference)
+    matching = _match_signs(fused, ref, gate_m=config.gate_m, match_on=config.match_on)
+    return MapScore(
+        tp=len(matching),
+        fp=fused.num_rows - len(matching),
+        fn=ref.num_rows - len(matching),
+        sum_sq_error_m2=matching.sum_sq_error_m2,
+        gate_m=config.gate_m,
+        match_on=config.match_on,
+        matches=matching,
+    )
 
 
 def score_matches(matches: pa.Table, *, gate_m: float, match_on: str) -> pa.Table:
@@ -198,17 +223,21 @@ def _equal_or_null(column: pa.ChunkedArray, value: str | None) -> pa.ChunkedArra
     return pc.is_null(column) if value is None else pc.fill_null(pc.equal(column, value), fill_value=False)
 
 
+def _match_signs(fused: pa.Table, ref: pa.Table, *, gate_m: float, match_on: str) -> Matching:
+    """Match two layers of signs.
+
+    In Earth-centred coordinates a chord of metres is the distance on the ground to 1e-13, whatever the extent.
+    """
+    codes, ref_codes = _codes(fused, ref, match_on)
+    return match_points(to_ecef(*lonlat(fused)), to_ecef(*lonlat(ref)), gate_m=gate_m, codes=codes, ref_codes=ref_codes)
+
+
 def _match_layer(
     fused: pa.Table, ref: pa.Table, labels: dict[str, Any], *, gate_m: float, match_on: str, tile_zoom: int
 ) -> pa.Table:
     """Return the `matches` rows of one map and its reference."""
-    lon, lat = lonlat(fused)
-    ref_lon, ref_lat = lonlat(ref)
-    codes, ref_codes = _codes(fused, ref, match_on)
-    # Earth-centred coordinates: a chord of metres is the distance to 1e-13, anywhere, whatever the extent.
-    matching = match_points(
-        to_ecef(lon, lat), to_ecef(ref_lon, ref_lat), gate_m=gate_m, codes=codes, ref_codes=ref_codes
-    )
+    (lon, lat), (ref_lon, ref_lat) = lonlat(fused), lonlat(ref)
+    matching = _match_signs(fused, ref, gate_m=gate_m, match_on=match_on)
     i, j, outcome, distance = _outcomes(matching, fused.num_rows, ref.num_rows)
     here_lon = np.where(j >= 0, _take(ref_lon, j), _take(lon, i))
     here_lat = np.where(j >= 0, _take(ref_lat, j), _take(lat, i))
