@@ -130,7 +130,7 @@ def _checked_pair(xy: ArrayLike, ref_xy: ArrayLike, *, gate_m: float) -> tuple[F
         )
     extent_m = np.maximum(at.max(axis=0), ref_at.max(axis=0)) - np.minimum(at.min(axis=0), ref_at.min(axis=0))
     axes = np.argsort(-extent_m, kind="stable")
-    return at[:, axes], ref_at[:, axes]
+    return np.ascontiguousarray(at[:, axes]), np.ascontiguousarray(ref_at[:, axes])
 
 
 def _checked_points(xy: ArrayLike, *, where: str, gate_m: float) -> Floats:
@@ -206,23 +206,22 @@ def _pairs_in_gate(points: _Points, ref: _Points, gate_m: float) -> tuple[Ints, 
     Both sets come in canonical order, so in each of the three strips at a point the first candidate only ever moves
     forward: linear in points and pairs.
     """
-    n_points, n_ref, n_pairs = len(points.at), len(ref.at), 0
+    at, ref_at, ref_code, ref_strip = points.at, ref.at, ref.code, ref.strip
+    n_points, n_ref, n_pairs = len(at), len(ref_at), 0
     start = np.empty(n_points + 1, np.int64)
     column, sq_distance_m2 = np.empty(n_points + 1, np.int64), np.empty(n_points + 1)
     first = np.zeros(3, np.int64)
     for i in range(n_points):
         start[i] = n_pairs
-        code, along = points.code[i], points.at[i, 1]
+        code, along = points.code[i], at[i, 1]
         for side in range(3):
             strip = points.strip[i] + side - 1
             k = first[side]
-            while k < n_ref and (
-                _precedes(ref, k, code, strip) or (_is_in(ref, k, code, strip) and along - ref.at[k, 1] >= gate_m)
-            ):
+            while k < n_ref and _ahead(ref_code[k], ref_strip[k], ref_at[k, 1], code, strip, along) <= -gate_m:
                 k += 1
             first[side] = k
-            while k < n_ref and _is_in(ref, k, code, strip) and ref.at[k, 1] - along < gate_m:
-                sq_m2 = _sq_distance(points.at[i], ref.at[k])
+            while k < n_ref and _ahead(ref_code[k], ref_strip[k], ref_at[k, 1], code, strip, along) < gate_m:
+                sq_m2 = _sq_distance(at, i, ref_at, k)
                 if math.sqrt(sq_m2) < gate_m:
                     if n_pairs == column.size:
                         column, sq_distance_m2 = _doubled(column), _doubled(sq_distance_m2)
@@ -234,22 +233,20 @@ def _pairs_in_gate(points: _Points, ref: _Points, gate_m: float) -> tuple[Ints, 
 
 
 @njit(cache=True)
-def _is_in(ref: _Points, k: int, code: int, strip: float) -> Any:
-    """Whether point k lies in this strip of this code."""
-    return ref.code[k] == code and ref.strip[k] == strip
+def _ahead(code: int, strip: float, along: float, code_0: int, strip_0: float, along_0: float) -> float:  # noqa: PLR0917 (a kernel: numbers are passed in registers, structs are not)
+    """Return how far a point is ahead of a place in canonical order, metres; infinite in another code or strip."""
+    if code != code_0:
+        return -math.inf if code < code_0 else math.inf
+    if strip != strip_0:
+        return -math.inf if strip < strip_0 else math.inf
+    return along - along_0
 
 
 @njit(cache=True)
-def _precedes(ref: _Points, k: int, code: int, strip: float) -> Any:
-    """Whether point k comes before this strip of this code."""
-    return ref.code[k] < code or (ref.code[k] == code and ref.strip[k] < strip)
-
-
-@njit(cache=True)
-def _sq_distance(a: Floats, b: Floats) -> float:
+def _sq_distance(a: Floats, i: int, b: Floats, k: int) -> float:
     total = 0.0
-    for axis in range(a.size):
-        total += (b[axis] - a[axis]) ** 2
+    for axis in range(a.shape[1]):
+        total += (b[k, axis] - a[i, axis]) ** 2
     return total
 
 
