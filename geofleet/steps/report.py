@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Okabe and Ito's colours, told apart by the colour-blind; shapes differ too, for print without colour.
-_MARKS = {
+_MARKS: dict[str, dict[str, Any]] = {
     "TP": {"marker": "o", "c": "#009E73", "s": 34, "label": "found (TP)", "zorder": 5},
     "FP": {"marker": "X", "c": "#D55E00", "s": 60, "label": "not in the reference (FP)", "zorder": 7},
     "FN": {"marker": "D", "facecolors": "none", "edgecolors": "#CC0000", "s": 70, "label": "missed (FN)", "zorder": 6},
