@@ -288,7 +288,7 @@ def _codes(classes: Labels | None, ref_classes: Labels | None) -> tuple[Ints, In
     """Return one number a label, equal for equal labels of either set."""
     if classes is None or ref_classes is None:
         raise InputError("only one of the two sets has classes", todo="Give classes for both sets, or for neither.")
-    labels, ref_labels = np.asarray(classes).tolist(), np.asarray(ref_classes).tolist()
+    labels, ref_labels = (v.tolist() if isinstance(v, np.ndarray) else list(v) for v in (classes, ref_classes))
     both = [*labels, *ref_labels]
     try:
         code_of = {label: code for code, label in enumerate(dict.fromkeys(both))}
