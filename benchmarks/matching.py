@@ -98,7 +98,7 @@ def timed(solver: Callable[[Points, Points], float], points: tuple[Points, Point
 
 
 def _resident_mb(peak: str) -> float:
-    """Read the resident memory now (`VmRSS`) or its peak (`VmHWM`); unlike `ru_maxrss`, not inherited from the parent."""
+    """Read the resident memory now (`VmRSS`) or its peak (`VmHWM`); `ru_maxrss` is inherited from the parent."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     return next(float(line.split()[1]) / 1024 for line in lines if line.startswith(peak))
 
