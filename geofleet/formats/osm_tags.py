@@ -1,8 +1,9 @@
 """What OpenStreetMap tags say about traffic signs: `traffic_sign=DE:274.1[30],1022-10;DE:240` and its relatives.
 
-Grammar, as the OpenStreetMap wiki gives it and as the map really has it (https://wiki.openstreetmap.org/wiki/Key:traffic_sign):
-`;` separates signs, `,` adds supplementary plates to the sign before it, brackets hold a value or what a direction
-sign shows, and neither separator counts inside brackets. A country prefix holds until the next one.
+Grammar, as https://wiki.openstreetmap.org/wiki/Key:traffic_sign gives it and as the map really has it: `;` separates
+signs, `,` adds supplementary plates to the sign before it, brackets hold a value or what a direction sign shows, and
+neither separator counts inside brackets. A country prefix holds until the next one. `traffic_sign:2` … name further
+plates of the same pole.
 """
 
 from __future__ import annotations
@@ -12,26 +13,46 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
+from geofleet.taxonomy import load_taxonomy
+
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping, Sequence
 
-SIGN_KEY = re.compile(r"traffic_sign(?::(?P<slot>\d+))?(?::(?P<side>forward|backward|both))?")
-FACING_KEY = re.compile(r"traffic_sign(?::(?P<slot>\d+))?:(?:facing|direction)")
-POINT_HIGHWAYS = {"stop": "stop", "give_way": "give_way"}
-_COUNTRY = re.compile(r"\s*(?:([A-Za-z]{2})(?:[:_](?=\S)|:\s*))?(.*)", re.DOTALL)
-_CLOSERS = {"]": "[", ")": "("}
+    from geofleet.taxonomy import Meaning
 
+POINT_HIGHWAYS = {"stop": "stop", "give_way": "give_way", "traffic_signals": "traffic_signals"}
+_SLOTS = ("", *(f":{n}" for n in range(1, 13)))
+_SIDES = ("", ":forward", ":backward", ":both")
+SIGN_KEYS = tuple(f"traffic_sign{slot}{side}" for slot in _SLOTS for side in _SIDES)
+_SIGN_KEY = re.compile(r"traffic_sign(?::(?P<slot>\d+))?(?::(?P<side>forward|backward|both))?")
+_COUNTRY = re.compile(r"(?:([A-Za-z]{2}):\s*)?(.*)", re.DOTALL)
+_NUMBER = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*°?\s*")
+_SPEED = re.compile(r"\s*(\d+(?:[.,]\d+)?)\s*(km/h|kmh|kph|mph|knots)?\s*")
+_KMH = {"mph": 1.609344, "knots": 1.852}
 COMPASS_DEG = {
-    name: index * 22.5
-    for index, name in enumerate(
-        ("N", "NNE", "NE", "ENE", "E", "ESE", "SE", "SSE", "S", "SSW", "SW", "WSW", "W", "WNW", "NW", "NNW")
-    )
+    name: index * 22.5 for index, name in enumerate("N NNE NE ENE E ESE SE SSE S SSW SW WSW W WNW NW NNW".split())
+}
+
+# osmnx.graph_from_*(network_type="drive"), version 2.1: patterns that must not be found in the value of a tag
+NOT_DRIVABLE = {
+    key: re.compile(pattern)
+    for key, pattern in {
+        "highway": (
+            "abandoned|bridleway|bus_guideway|construction|corridor|cycleway|elevator|escalator|footway|no|path|"
+            "pedestrian|planned|platform|proposed|raceway|razed|rest_area|service|services|steps|track"
+        ),
+        "area": "yes",
+        "access": "private",
+        "motor_vehicle": "no",
+        "motorcar": "no",
+        "service": "alley|driveway|emergency_access|parking|parking_aisle|private",
+    }.items()
 }
 
 
 @dataclass(frozen=True, slots=True)
 class TaggedSign:
-    """One plate read from a node's tags.
+    """One plate as a value names it.
 
     Parameters
     ----------
@@ -42,9 +63,9 @@ class TaggedSign:
     slot
         The n of `traffic_sign:n`; 1 for `traffic_sign`.
     group
-        Number of the `;` group within the value: plates belong to the main sign of their group.
+        Number of the `;` group within the value: a plate belongs to the main sign of its group.
     follows
-        Stands after a comma, where plates stand.
+        Stands after a comma, where supplementary plates stand.
     side
         `forward`, `backward` or "".
     """
@@ -56,10 +77,36 @@ class TaggedSign:
     follows: bool
     side: str
 
-    @property
-    def raw_code(self) -> str:
-        """The code with its country."""
-        return f"{self.country}:{self.code}" if self.country else self.code
+
+@dataclass(frozen=True, slots=True)
+class NodeSign:
+    """One sign of a node, understood.
+
+    Parameters
+    ----------
+    raw_code
+        Code with country, as the source has it.
+    country
+        ISO 3166-1 alpha-2, or None.
+    meaning
+        What the taxonomy says.
+    kind
+        The taxonomy's kind; `plate` for an unknown code where plates stand.
+    parent
+        Place of a plate's main sign among the node's signs, or None.
+    side
+        `forward` or `backward` along the way it stands at, or "".
+    facing_deg
+        As the tags say, clockwise from north, or None.
+    """
+
+    raw_code: str
+    country: str | None
+    meaning: Meaning
+    kind: str
+    parent: int | None
+    side: str
+    facing_deg: float | None
 
 
 @lru_cache(maxsize=65536)
@@ -68,44 +115,139 @@ def split_value(value: str) -> tuple[tuple[int, bool, str, str], ...]:
     found = []
     country = ""
     for group, text in enumerate(split_outside_brackets(value, ";")):
-        parts = [part for part in split_outside_brackets(text, ",") if part.strip()]
-        for position, part in enumerate(parts):
-            match = _COUNTRY.fullmatch(part.strip())
-            prefix, code = (match[1], match[2]) if match else (None, part)
+        parts = [part.strip() for part in split_outside_brackets(text, ",")]
+        for position, part in enumerate(part for part in parts if part):
+            match = _COUNTRY.fullmatch(part)
+            prefix, code = (match[1], match[2].strip()) if match else (None, part)
             country = prefix.upper() if prefix else country
-            if code.strip():
-                found.append((group, position > 0, country, code.strip()))
+            if code:
+                found.append((group, position > 0, country, code))
     return tuple(found)
 
 
 def split_outside_brackets(text: str, separator: str) -> list[str]:
-    """Split at `separator` where no bracket is open; a bracket that never closes opens nothing."""
+    """Split at `separator` where no square bracket is open; in a text whose brackets do not pair, everywhere."""
     if separator not in text:
         return [text]
+    if text.count("[") != text.count("]"):
+        return text.split(separator)
     parts, start, depth = [], 0, 0
-    balanced = text.count("[") == text.count("]")
     for index, letter in enumerate(text):
-        if letter == "[" and balanced:
-            depth += 1
-        elif letter == "]" and balanced:
-            depth = max(0, depth - 1)
-        elif letter == separator and not depth:
+        if letter == separator and depth <= 0:
             parts.append(text[start:index])
             start = index + 1
-    parts.append(text[start:])
-    return parts
+        depth += (letter == "[") - (letter == "]")
+    return [*parts, text[start:]]
 
 
-def tagged_signs(tags: Mapping[str, str]) -> Iterator[TaggedSign]:
-    """Yield every plate that a node's tags name, slot by slot.
+def is_sign_key(key: str) -> bool:
+    """Tell whether a key names signs; `traffic_sign:note` and `traffic_signals` do not."""
+    return _SIGN_KEY.fullmatch(key) is not None
 
-    `highway=stop|give_way` and a bare `maxspeed` count when no `traffic_sign` key says more.
-    """
-    keys = []
+
+def tagged_signs(tags: Mapping[str, str]) -> list[TaggedSign]:
+    """Return every plate that the `traffic_sign` keys of a node name, slot by slot."""
+    values = []
     for key, value in tags.items():
-        match = SIGN_KEY.fullmatch(key)
+        match = _SIGN_KEY.fullmatch(key)
         if match:
-            keys.append((int(match["slot"] or 1), match["side"] or "", value))
-    for slot, side, value in sorted(keys):
-        for group, follows, country, code in split_value(value):
-            yield TaggedSign(code, country, slot, group, follows, side.replace("both", ""))
+            values.append((int(match["slot"] or 1), (match["side"] or "").replace("both", ""), value))
+    return [
+        TaggedSign(code, country, slot, group, follows, side)
+        for slot, side, value in sorted(values)
+        for group, follows, country, code in split_value(value)
+    ]
+
+
+def node_signs(tags: Mapping[str, str]) -> list[NodeSign]:
+    """Return the signs of a node, in the order of their slots.
+
+    `highway=stop|give_way|traffic_signals` is a sign of its own when no `traffic_sign` key says so already.
+    """
+    plates = tagged_signs(tags)
+    meanings = [_meaning(plate, tags) for plate in plates]
+    word = POINT_HIGHWAYS.get(tags.get("highway", ""))
+    if word and load_taxonomy().meaning(word).concept not in {meaning.concept for meaning in meanings}:
+        plates.append(TaggedSign(word, "", plates[-1].slot + 1 if plates else 1, 0, follows=False, side=""))
+        meanings.append(load_taxonomy().meaning(word))
+    kinds = [
+        "plate" if plate.follows and not meaning.known else meaning.kind
+        for plate, meaning in zip(plates, meanings, strict=True)
+    ]
+    return [
+        NodeSign(
+            f"{plate.country}:{plate.code}" if plate.country else plate.code,
+            plate.country or None,
+            meaning,
+            kind,
+            _parent(index, plates, kinds) if kind == "plate" else None,
+            plate.side or _side(tags),
+            _facing(plate, tags),
+        )
+        for index, (plate, meaning, kind) in enumerate(zip(plates, meanings, kinds, strict=True))
+    ]
+
+
+def is_drivable(tags: Mapping[str, str]) -> bool:
+    """Tell whether a way's tags pass osmnx's `drive` filter."""
+    return "highway" in tags and not any(pattern.search(tags.get(key, "")) for key, pattern in NOT_DRIVABLE.items())
+
+
+def oneway_of(tags: Mapping[str, str]) -> int:
+    """Return 1 for a way that is one-way along its points, -1 against them, 0 else."""
+    value = tags.get("oneway", "")
+    if value in {"-1", "reverse"}:
+        return -1
+    implied = tags.get("junction") in {"roundabout", "circular"} or tags.get("highway") == "motorway"
+    return int(value in {"yes", "true", "1"} or (implied and value != "no"))
+
+
+def speed_kmh(value: str | None) -> float | None:
+    """Return a `maxspeed` value in km/h; None for words such as `none`, `walk` and `DE:urban`."""
+    match = _SPEED.fullmatch(value or "")
+    return float(match[1].replace(",", ".")) * _KMH.get(match[2] or "", 1.0) if match else None
+
+
+def _meaning(plate: TaggedSign, tags: Mapping[str, str]) -> Meaning:
+    """Look a code up; a number or an end that the code leaves out comes from the tag of its name."""
+    taxonomy = load_taxonomy()
+    if plate.code == "city_limit" and tags.get("city_limit") == "end":
+        return taxonomy.meaning("city_limit:end")
+    if plate.code.startswith("max") and tags.get(plate.code):
+        return taxonomy.meaning(f"{plate.code}[{tags[plate.code]}]", country=plate.country)
+    meaning = taxonomy.meaning(plate.code, country=plate.country)
+    speed = taxonomy.concepts[meaning.concept].unit == "km/h" if meaning.known else False
+    if speed and meaning.value is None and tags.get("maxspeed"):
+        return taxonomy.meaning(f"{plate.code}[{tags['maxspeed']}]", country=plate.country)
+    return meaning
+
+
+def _parent(index: int, plates: Sequence[TaggedSign], kinds: Sequence[str]) -> int | None:
+    """Return the main sign of a plate: of its own group, else the nearest before it, else the nearest after it."""
+    own = (plates[index].slot, plates[index].group, plates[index].side)
+    mains = [i for i, kind in enumerate(kinds) if kind not in {"plate", "other"}]
+    same = [i for i in mains if (plates[i].slot, plates[i].group, plates[i].side) == own]
+    before = [i for i in mains if i < index]
+    return same[0] if same else before[-1] if before else mains[0] if mains else None
+
+
+def _side(tags: Mapping[str, str]) -> str:
+    for key in ("direction", "traffic_sign:direction", "traffic_signals:direction"):
+        if tags.get(key) in {"forward", "backward"}:
+            return tags[key]
+    return ""
+
+
+def _facing(plate: TaggedSign, tags: Mapping[str, str]) -> float | None:
+    """Return the facing that a tag states in degrees or as a point of the compass."""
+    slots = ("", ":1") if plate.slot == 1 else (f":{plate.slot}",)
+    keys = [f"traffic_sign{slot}:{name}" for slot in slots for name in ("facing", "direction")]
+    for value in (tags[key] for key in (*keys, "direction") if key in tags):
+        parts = value.split(";")
+        text = parts[plate.group] if plate.group < len(parts) else parts[0]
+        number = _NUMBER.fullmatch(text)
+        if number:
+            return float(number[1]) % 360.0
+        if text.strip().upper() in COMPASS_DEG:
+            return COMPASS_DEG[text.strip().upper()]
+    return None

@@ -121,9 +121,7 @@ class Taxonomy:
 
     def group_of(self, concepts: Sequence[str]) -> NDArray[np.object_]:
         """Return the group of each concept; raw and unknown concepts belong to `other`."""
-        return np.array(
-            [self.concepts[c].group if c in self.concepts else OTHER_GROUP for c in concepts], dtype=object
-        )
+        return np.array([self.concepts[c].group if c in self.concepts else OTHER_GROUP for c in concepts], dtype=object)
 
     def kind_of(self, concepts: Sequence[str]) -> NDArray[np.object_]:
         """Return the kind of each concept; raw and unknown concepts are `main`."""
@@ -137,9 +135,7 @@ def load_taxonomy() -> Taxonomy:
     concepts: dict[str, Concept] = {}
     rules = []
     for row in csv.DictReader(text.splitlines()):
-        concept = concepts.setdefault(
-            row["concept"], Concept(row["concept"], row["group"], row["kind"], row["unit"])
-        )
+        concept = concepts.setdefault(row["concept"], Concept(row["concept"], row["group"], row["kind"], row["unit"]))
         pattern = re.compile(row["code_pattern"].replace("{n}", NUMBER, 1).replace("{n}", r"\d+"), re.IGNORECASE)
         rules.append(_Rule(concept, pattern, row["value_rule"], row["unit"], row["scheme"], row["country"]))
     return Taxonomy(concepts, tuple(rules))
