@@ -189,6 +189,7 @@ def in_view_of(poses: Poses, signs: SignField, model: SensorModel) -> Sightings:
             signs.cell_sign,
             signs.origin_xy_m,
             signs.shape,
+            signs.cell_m,
             model.range_m,
             model.half_fov_rad,
         )

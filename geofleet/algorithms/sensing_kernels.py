@@ -23,13 +23,14 @@ def in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
     cell_sign: Ints,
     origin_xy_m: Floats,
     shape: tuple[int, int],
+    cell_m: float,
     range_m: float,
     half_fov_rad: float,
 ) -> tuple[Ints, Ints, Floats, Floats]:
     """Return frame, sign, distance in metres and bearing in radians of every sign in the cone, by frame.
 
-    Signs lie in a grid of square cells of `range_m` (`cell_start` and `cell_sign`, by row), so a frame looks at nine
-    cells. The angle is compared by its cosine, which falls all the way from 0 to π.
+    Signs lie in a grid of square cells of `cell_m`, at least `range_m` wide (`cell_start`, `cell_sign`, by row), so a
+    frame looks at nine cells. The angle is compared by its cosine, which falls all the way from 0 to π.
     """
     frames, signs = np.empty(1024, dtype=np.int64), np.empty(1024, dtype=np.int64)
     distances, bearings = np.empty(1024), np.empty(1024)
@@ -37,8 +38,8 @@ def in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
     for frame in range(len(pose_xy_m)):
         x, y = pose_xy_m[frame, 0], pose_xy_m[frame, 1]
         ahead_x, ahead_y = np.cos(heading_rad[frame]), np.sin(heading_rad[frame])
-        column = int(np.floor((x - origin_xy_m[0]) / range_m))
-        row = int(np.floor((y - origin_xy_m[1]) / range_m))
+        column = int(np.floor((x - origin_xy_m[0]) / cell_m))
+        row = int(np.floor((y - origin_xy_m[1]) / cell_m))
         for r in range(max(row - 1, 0), min(row + 2, shape[0])):
             first, last = max(column - 1, 0), min(column + 2, shape[1])
             if first >= last:

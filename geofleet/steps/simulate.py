@@ -14,20 +14,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import shapely
 
-from geofleet.algorithms.geodesy import EnuFrame
-from geofleet.algorithms.scene import is_repeated, nearest_m, within_corridor
-from geofleet.algorithms.sensing import GHOST, PassSensing, SensorModel, SignField, sense_pass
+from geofleet.algorithms.sensing import GHOST, PassSensing, SensorModel, sense_pass
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import TrackerModel, Tracks, track_pass
-from geofleet.algorithms.trajectory import DriveLine, Poses, drive_line, resample, wander
+from geofleet.algorithms.trajectory import Poses, resample, wander
 from geofleet.errors import ConfigError, InputError
 from geofleet.tables.manifest import hash_path, write_manifest
-from geofleet.tables.schemas import BBOX, DETECTIONS, DRIVES, GEOMETRY, PASSES, REFERENCE, RUNS, SIGNS, TRUTH
-from geofleet.tables.store import atomic_path, build_table, lonlat, read_table, sort_by_key, write_table
-from geofleet.taxonomy import load_taxonomy
+from geofleet.tables.scenes import Drive, Scene, load_drive, load_scene
+from geofleet.tables.schemas import BBOX, DETECTIONS, GEOMETRY, PASSES, REFERENCE, RUNS, TRUTH
+from geofleet.tables.store import atomic_path, build_table, lonlat, sort_by_key, write_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -47,6 +44,7 @@ VEHICLES_A_PART = 250
 """Vehicles whose tracks are in memory at once, and in one file of `truth`: part of the layout, not a setting."""
 
 _OUTPUTS = {"runs.parquet", "reference.parquet", "passes.parquet", "detections", "truth", "_manifest.json"}
+_LIMITS = {"n_vehicles": (1, 100_000), "n_replicates": (1, 100_000), "seed": (0, 2**63 - 1), "n_workers": (1, 1024)}
 _SHAPING = ("scene", "fleet", "sensor", "tracking")
 
 
@@ -66,32 +64,12 @@ class SimulateResult:
 
 
 @dataclass(frozen=True, slots=True)
-class _Drive:
-    """A drive in the frame of the study; `t_start` is the time of its first epoch, when it has one."""
-
-    drive_id: str
-    frame: EnuFrame
-    line: DriveLine
-    t_start: np.datetime64 | None
-
-
-@dataclass(frozen=True, slots=True)
-class _Scene:
-    """The signs of a study: rows of the layer, their places and their classes."""
-
-    table: pa.Table
-    field: SignField
-    sign_ids: NDArray[np.object_]
-    classes: NDArray[np.object_]
-
-
-@dataclass(frozen=True, slots=True)
 class _Study:
     """Everything that the passes of all runs share."""
 
     config: Config
-    drive: _Drive
-    scene: _Scene
+    drive: Drive
+    scene: Scene
     base: Poses
     sensor: SensorModel
     tracker: TrackerModel
@@ -306,7 +284,7 @@ def _pass(study: _Study, ids: dict[str, str], sensed: PassSensing, times: NDArra
     )
 
 
-def _truth(scene: _Scene, ids: dict[str, str], tracks: Tracks) -> pa.Table:
+def _truth(scene: Scene, ids: dict[str, str], tracks: Tracks) -> pa.Table:
     is_ghost = tracks.sign == GHOST
     true_code = scene.field.class_code[tracks.sign]  # that of a ghost is masked below
     return build_table(
@@ -323,7 +301,7 @@ def _truth(scene: _Scene, ids: dict[str, str], tracks: Tracks) -> pa.Table:
     )
 
 
-def _reference(scene: _Scene, run_id: str, n_passes: Ints, n_frames: Ints) -> pa.Table:
+def _reference(scene: Scene, run_id: str, n_passes: Ints, n_frames: Ints) -> pa.Table:
     columns = {
         name: scene.table[name].combine_chunks() for name in scene.table.column_names if name not in (GEOMETRY, BBOX)
     }
@@ -363,8 +341,8 @@ def _manifest(result: SimulateResult, signs: Path, drive: Path, config: Config, 
 
 def _load_study(signs: Path, drive: Path, config: Config) -> _Study:
     sensor = SensorModel(**config.sensor.model_dump(exclude={"sensor_kind"}))
-    road = _load_drive(drive)
-    scene = _load_scene(signs, road, config)
+    road = load_drive(drive)
+    scene = load_scene(signs, road, **config.scene.model_dump(), cell_m=sensor.range_m)
     if len(scene.classes) == 1 and sensor.semantic_rate < 1:
         raise ConfigError(
             f"semantic_rate = {sensor.semantic_rate} confuses classes, but all {len(scene.sign_ids)} signs of the "
@@ -381,62 +359,11 @@ def _load_study(signs: Path, drive: Path, config: Config) -> _Study:
     return _Study(config, road, scene, base, sensor, tracker)
 
 
-def _load_drive(path: Path) -> _Drive:
-    table = read_table(DRIVES, path, columns=["drive_id", "seq", "t_utc", "segment", GEOMETRY, BBOX])
-    names = pc.unique(table["drive_id"]).to_pylist()
-    if len(names) != 1:
-        raise InputError(
-            f"one drive is needed, found {len(names)}{': ' if names else ''}{', '.join(names[:5])}.",
-            where=str(path),
-            todo="Give a drives table with one drive_id.",
-        )
-    table = table.sort_by("seq")
-    lon, lat = lonlat(table)
-    frame = EnuFrame.around(lon, lat)
-    try:
-        line = drive_line(frame.to_enu(lon, lat), table["segment"].to_numpy())
-    except InputError as error:
-        raise InputError(error.what, where=str(path), todo=error.todo) from None
-    first = table["t_utc"][0].as_py()
-    t_start = None if first is None else np.datetime64(first.replace(tzinfo=None), "us")
-    return _Drive(names[0], frame, line, t_start)
-
-
-def _load_scene(path: Path, road: _Drive, config: Config) -> _Scene:
-    """Return the main signs of the scene's groups near the drive, equal classes at one point counted once."""
-    layer = read_table(SIGNS, path, columns=[*SIGNS.arrow(()).names])
-    groups = load_taxonomy().group_of(layer["concept"].to_pylist())
-    wanted = np.array([group in config.scene.groups for group in groups], dtype=np.bool_)
-    wanted &= pc.equal(layer["kind"], "main").to_numpy()
-    layer = layer.filter(pa.array(wanted)).sort_by("sign_id")
-    if not layer.num_rows:
-        raise InputError(
-            f"none of the {len(wanted)} signs is a main sign of the groups {', '.join(config.scene.groups)}.",
-            where=str(path),
-            todo="Name other groups in [scene] groups.",
-        )
-    lon, lat = lonlat(layer)
-    near = within_corridor(lon, lat, road.frame, road.line, config.scene.corridor_m)
-    if not near.any():
-        raise InputError(
-            f"no sign is within {config.scene.corridor_m:g} m of the drive {road.drive_id!r}; the nearest of "
-            f"{layer.num_rows} is {nearest_m(lon, lat, road.frame, road.line):,.0f} m away.",
-            where=str(path),
-            todo="Give signs and a drive of the same place, or set corridor_m wider.",
-        )
-    layer, xy_m = layer.filter(pa.array(near)), road.frame.to_enu(lon[near], lat[near])
-    kept = ~is_repeated(xy_m, layer["sign_class"].to_pylist(), layer["support_id"].to_pylist())
-    layer, xy_m = layer.filter(pa.array(kept)), xy_m[kept]
-    classes, code = np.unique(np.array(layer["sign_class"].to_pylist(), dtype=object), return_inverse=True)
-    field = SignField(xy_m, code, n_classes=len(classes), cell_m=config.sensor.range_m)
-    return _Scene(layer, field, np.array(layer["sign_id"].to_pylist(), dtype=object), classes)
-
-
 def _check_numbers(**numbers: int) -> None:
     for name, number in numbers.items():
-        least = 0 if name == "seed" else 1
-        if number < least:
-            raise ConfigError(f"{name} is {number}, but must be at least {least}.", todo=f"Set {name} higher.")
+        least, most = _LIMITS[name]
+        if not least <= number <= most:
+            raise ConfigError(f"{name} is {number}.", todo=f"Set {name} between {least} and {most}.")
 
 
 def _check_out(out: Path) -> None:

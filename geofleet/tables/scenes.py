@@ -1,0 +1,136 @@
+"""A study's scene and drive: rows of the tables `signs` and `drives` as the arrays that a simulation runs on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from geofleet.algorithms.geodesy import EnuFrame
+from geofleet.algorithms.scene import is_repeated, nearest_m, within_corridor
+from geofleet.algorithms.sensing import SignField
+from geofleet.algorithms.trajectory import DriveLine, drive_line
+from geofleet.errors import ConfigError, InputError
+from geofleet.tables.schemas import BBOX, DRIVES, GEOMETRY, SIGNS
+from geofleet.tables.store import lonlat, read_table
+from geofleet.taxonomy import load_taxonomy
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """A drive in its own ENU frame; `t_start` is the time of its first epoch, UTC, when it has one."""
+
+    drive_id: str
+    frame: EnuFrame
+    line: DriveLine
+    t_start: np.datetime64 | None
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The signs of a study: their rows (sorted by sign_id), their places and class codes, and what the codes mean."""
+
+    table: pa.Table
+    field: SignField
+    sign_ids: NDArray[np.object_]
+    classes: NDArray[np.object_]
+
+
+def load_drive(path: Path) -> Drive:
+    """Read the one drive of a `drives` table.
+
+    Raises
+    ------
+    InputError
+        The table cannot be used, holds several drives or none, or the drive does not move.
+    """
+    table = read_table(DRIVES, path, columns=["drive_id", "seq", "t_utc", "segment", GEOMETRY, BBOX])
+    names = pc.unique(table["drive_id"]).to_pylist()
+    if len(names) != 1:
+        raise InputError(
+            f"one drive is needed, found {len(names)}{': ' if names else ''}{', '.join(names[:5])}.",
+            where=str(path),
+            todo="Give a drives table with one drive_id.",
+        )
+    table = table.sort_by("seq")
+    lon, lat = lonlat(table)
+    frame = EnuFrame.around(lon, lat)
+    try:
+        line = drive_line(frame.to_enu(lon, lat), table["segment"].to_numpy())
+    except InputError as error:
+        raise InputError(error.what, where=str(path), todo=error.todo) from None
+    first = table["t_utc"][0].as_py()
+    t_start = None if first is None else np.datetime64(first.replace(tzinfo=None), "us")
+    return Drive(names[0], frame, line, t_start)
+
+
+def load_scene(path: Path, drive: Drive, *, corridor_m: float, groups: Sequence[str], cell_m: float) -> Scene:
+    """Read the main signs of some groups near the drive, equal classes at one point counted once.
+
+    Parameters
+    ----------
+    path
+        A `signs` table.
+    drive
+        The drive; the scene is in its frame.
+    corridor_m
+        Signs at most this far from the drive are the scene.
+    groups
+        Groups of the taxonomy.
+    cell_m
+        See `SignField`.
+
+    Raises
+    ------
+    ConfigError
+        A group is unknown.
+    InputError
+        The table cannot be used, or no sign of it belongs to the scene.
+    """
+    layer = _signs_of_groups(path, groups)
+    lon, lat = lonlat(layer)
+    near = within_corridor(lon, lat, drive.frame, drive.line, corridor_m)
+    if not near.any():
+        raise InputError(
+            f"no sign is within {corridor_m:g} m of the drive {drive.drive_id!r}; the nearest of {layer.num_rows} is "
+            f"{nearest_m(lon, lat, drive.frame, drive.line):,.0f} m away.",
+            where=str(path),
+            todo="Give signs and a drive of the same place, or set corridor_m wider.",
+        )
+    layer, xy_m = layer.filter(pa.array(near)), drive.frame.to_enu(lon[near], lat[near])
+    kept = ~is_repeated(xy_m, layer["sign_class"].to_pylist(), layer["support_id"].to_pylist())
+    layer, xy_m = layer.filter(pa.array(kept)), xy_m[kept]
+    classes, code = np.unique(np.array(layer["sign_class"].to_pylist(), dtype=object), return_inverse=True)
+    field = SignField(xy_m, code, n_classes=len(classes), cell_m=cell_m)
+    return Scene(layer, field, np.array(layer["sign_id"].to_pylist(), dtype=object), classes)
+
+
+def _signs_of_groups(path: Path, groups: Sequence[str]) -> pa.Table:
+    taxonomy = load_taxonomy()
+    unknown = sorted(set(groups) - set(taxonomy.groups))
+    if unknown:
+        raise ConfigError(
+            f"unknown group {', '.join(unknown)}.",
+            where="[scene] groups",
+            todo=f"Groups are {', '.join(taxonomy.groups)}.",
+        )
+    layer = read_table(SIGNS, path, columns=SIGNS.arrow(()).names)
+    is_main = pc.equal(layer["kind"], "main").to_numpy()
+    is_wanted = np.isin(taxonomy.group_of(layer["concept"].to_pylist()).astype(str), list(groups))
+    found = layer.filter(pa.array(is_main & is_wanted)).sort_by("sign_id")
+    if not found.num_rows:
+        raise InputError(
+            f"none of the {layer.num_rows} signs is a main sign of the groups {', '.join(groups)}.",
+            where=str(path),
+            todo="Give another layer, or name other groups in [scene] groups.",
+        )
+    return found
