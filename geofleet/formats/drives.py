@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 __all__ = ["FORMAT", "detect", "read_drive"]
 
 FORMAT = "rtklib"
-GAP_FACTOR = 5.0
-GAP_S = 1.0
+GAP_FACTOR = 2.5  # one epoch may be missing, two make a gap
+GAP_S = 0.5
 STANDING_M = 0.3
 JUMP_M = 10.0
 JUMP_MPS2 = 20.0

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from geofleet.formats.osm_tags import NodeSign
-
 __all__ = ["FORMAT", "detect", "read_lanes", "read_signs"]
 
 FORMAT = "osm"

@@ -1,4 +1,4 @@
-"""Drivable ways of an OpenStreetMap file: their lines, and the nearest one to a sign, which gives its road and facing."""
+"""Drivable ways of an OpenStreetMap file, and the nearest one to each sign, which gives its road and facing."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ MAX_ROAD_DISTANCE_M = 50.0
 _CELL_DEG = (0.1, 0.05)  # longitude, latitude: one ENU frame each, at most 11 km across
 
 # ISO 3166-1 codes of countries that drive on the left
-LEFT_HAND = frozenset(
-    "AG AI AU BB BD BM BN BS BT BW CC CK CX CY DM FJ FK GB GD GG GY HK ID IE IM IN JE JM JP KE KI KN KY LC LK LS MO MS "
-    "MT MU MV MW MY MZ NA NF NP NR NU NZ PG PK PN SB SC SG SH SR SZ TC TH TK TL TO TT TV TZ UG VC VG VI WS ZA ZM ZW".split()
+_LEFT_HAND = (
+    "AG AI AU BB BD BM BN BS BT BW CC CK CX CY DM FJ FK GB GD GG GY HK ID IE IM IN JE JM JP KE KI KN KY LC LK LS MO "
+    "MS MT MU MV MW MY MZ NA NF NP NR NU NZ PG PK PN SB SC SG SH SR SZ TC TH TK TL TO TT TV TZ UG VC VG VI WS ZA ZM ZW"
 )
+LEFT_HAND = frozenset(_LEFT_HAND.split())
 
 
 @dataclass(frozen=True, slots=True)

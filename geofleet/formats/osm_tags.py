@@ -29,25 +29,21 @@ _COUNTRY = re.compile(r"(?:([A-Za-z]{2}):\s*)?(.*)", re.DOTALL)
 _NUMBER = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*°?\s*")
 _SPEED = re.compile(r"\s*(\d+(?:[.,]\d+)?)\s*(km/h|kmh|kph|mph|knots)?\s*")
 _KMH = {"mph": 1.609344, "knots": 1.852}
-COMPASS_DEG = {
-    name: index * 22.5 for index, name in enumerate("N NNE NE ENE E ESE SE SSE S SSW SW WSW W WNW NW NNW".split())
-}
+_COMPASS = "N NNE NE ENE E ESE SE SSE S SSW SW WSW W WNW NW NNW"
+COMPASS_DEG = {name: index * 22.5 for index, name in enumerate(_COMPASS.split())}
 
-# osmnx.graph_from_*(network_type="drive"), version 2.1: patterns that must not be found in the value of a tag
-NOT_DRIVABLE = {
-    key: re.compile(pattern)
-    for key, pattern in {
-        "highway": (
-            "abandoned|bridleway|bus_guideway|construction|corridor|cycleway|elevator|escalator|footway|no|path|"
-            "pedestrian|planned|platform|proposed|raceway|razed|rest_area|service|services|steps|track"
+# `highway` values made for cars, links included; the word `road` is for those not surveyed yet
+CAR_ROADS = frozenset(
+    {
+        *(
+            f"{name}{link}"
+            for name in ("motorway", "trunk", "primary", "secondary", "tertiary")
+            for link in ("", "_link")
         ),
-        "area": "yes",
-        "access": "private",
-        "motor_vehicle": "no",
-        "motorcar": "no",
-        "service": "alley|driveway|emergency_access|parking|parking_aisle|private",
-    }.items()
-}
+        *("unclassified", "residential", "living_street", "road"),
+    }
+)
+_CLOSED = {"area": {"yes"}, "access": {"private", "no"}, "motor_vehicle": {"no"}, "motorcar": {"no"}}
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,11 +148,18 @@ def tagged_signs(tags: Mapping[str, str]) -> list[TaggedSign]:
         match = _SIGN_KEY.fullmatch(key)
         if match:
             values.append((int(match["slot"] or 1), (match["side"] or "").replace("both", ""), value))
-    return [
-        TaggedSign(code, country, slot, group, follows, side)
-        for slot, side, value in sorted(values)
-        for group, follows, country, code in split_value(value)
-    ]
+    signs = []
+    carried = ""
+    for slot, side, value in sorted(values):
+        for group, follows, country, code in split_value(value):
+            carried = country or carried
+            signs.append(TaggedSign(code, carried if _is_code(code) else country, slot, group, follows, side))
+    return signs
+
+
+def _is_code(text: str) -> bool:
+    """Tell codes of a country from words, which hold for every country: codes have a digit before any bracket."""
+    return any(letter.isdigit() for letter in text.partition("[")[0])
 
 
 def node_signs(tags: Mapping[str, str]) -> list[NodeSign]:
@@ -189,8 +192,8 @@ def node_signs(tags: Mapping[str, str]) -> list[NodeSign]:
 
 
 def is_drivable(tags: Mapping[str, str]) -> bool:
-    """Tell whether a way's tags pass osmnx's `drive` filter."""
-    return "highway" in tags and not any(pattern.search(tags.get(key, "")) for key, pattern in NOT_DRIVABLE.items())
+    """Tell whether a way is a road that cars may use; service roads and private ones are not."""
+    return tags.get("highway") in CAR_ROADS and not any(tags.get(key) in values for key, values in _CLOSED.items())
 
 
 def oneway_of(tags: Mapping[str, str]) -> int:

@@ -2,7 +2,8 @@
 
 The format as `solution.c` of RTKLIB 2.4.3 writes it (https://github.com/tomojitakasu/RTKLIB): times as date and time
 or as GPS week and time of week, in GPST, UTC or JST; positions in decimal degrees or in degrees, minutes and seconds;
-15 columns, or 24 and more with velocities; separators blank, comma or semicolon. Baseline (e/n/u) solutions are refused.
+15 columns, or 24 and more with velocities; separators blank, comma or semicolon. Baseline (e/n/u) solutions are
+refused.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ ROLLOVER_WEEKS = 1024
 _RECENT_WEEKS = 2048  # the count of ten bits began again on 2019-04-07
 _JST_S = 9 * 3600.0
 _N_COLUMNS = 32
+_MAX_LAT, _MAX_LON = 90.0, 180.0
 
 # Days on which GPS time came to be one more second ahead of UTC (IERS Bulletin C)
 LEAP_DAYS = np.array(
@@ -137,7 +139,7 @@ def read_epochs(path: Path) -> tuple[Epochs, dict[str, int]]:
         _positive(_numbers(frame, rest + 3)),
     )
     readable = ~np.isnat(t_utc) & ~np.isnan(lat) & ~np.isnan(lon)
-    placed = readable & (np.abs(lat) <= 90.0) & (np.abs(lon) <= 180.0) & ~((lat == 0.0) & (lon == 0.0))  # noqa: PLR2004 - degrees
+    placed = readable & (np.abs(lat) <= _MAX_LAT) & (np.abs(lon) <= _MAX_LON) & ((lat != 0.0) | (lon != 0.0))
     if not placed.any():
         raise InputError(
             f"holds no epoch with a time and a position ({n_lines} lines read).",
@@ -165,7 +167,7 @@ def _header(lines: list[str]) -> _Header:
     date = _HEADER_DATE.search(text)
     return _Header(
         system=system,
-        is_baseline="baseline" in text.lower().replace("pos mode", "") and "e-baseline" in text or "e/n/u-baseline" in text,
+        is_baseline="baseline(m)" in text or "e/n/u-baseline" in text,
         is_ecef="x-ecef" in text or "x/y/z-ecef" in text,
         is_sexagesimal="latitude(d'" in titles,
         is_derived=any("program" in line and DERIVED in line for line in lines),

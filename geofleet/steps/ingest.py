@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 from geofleet.errors import InputError
 from geofleet.formats import drives, osm
 from geofleet.formats.reading import read_head
+from geofleet.tables.manifest import write_manifest
 from geofleet.tables.schemas import DRIVES, LANES, SIGNS
 from geofleet.tables.store import sort_by_key, write_table
 
@@ -99,7 +100,8 @@ def ingest_signs(
         There is no input, or one is missing, damaged or in no known format; nothing is written.
     """
     readers = {osm.FORMAT: lambda path: osm.read_signs(path, roads=roads)}
-    return _ingest(SIGNS, "kind", _plan(inputs, file_format, SIGN_FORMATS, readers), out, progress)
+    plan = _plan(inputs, file_format, SIGN_FORMATS, readers)
+    return _ingest(SIGNS, "kind", plan, out, progress=progress, settings={"roads": roads})
 
 
 def ingest_lanes(
@@ -107,7 +109,9 @@ def ingest_lanes(
 ) -> IngestResult:
     """Read drivable roads into one `lanes` table; parameters and errors as `ingest_signs`."""
     readers = {osm.FORMAT: osm.read_lanes}
-    return _ingest(LANES, "kind", _plan(inputs, file_format, SIGN_FORMATS, readers), out, progress)
+    return _ingest(
+        LANES, "kind", _plan(inputs, file_format, SIGN_FORMATS, readers), out, progress=progress, settings={}
+    )
 
 
 def ingest_drive(
@@ -115,7 +119,9 @@ def ingest_drive(
 ) -> IngestResult:
     """Read trajectories, one drive a file, into one `drives` table; parameters and errors as `ingest_signs`."""
     readers = {drives.FORMAT: drives.read_drive}
-    return _ingest(DRIVES, "fix_quality", _plan(inputs, file_format, DRIVE_FORMATS, readers), out, progress)
+    return _ingest(
+        DRIVES, "fix_quality", _plan(inputs, file_format, DRIVE_FORMATS, readers), out, progress=progress, settings={}
+    )
 
 
 def recognise(path: Path) -> str:
@@ -152,9 +158,15 @@ def _plan(
 
 
 def _ingest(
-    schema: Schema, kind: str, plan: list[tuple[Path, str, Reader]], out: Path, progress: Progress | None
+    schema: Schema,
+    kind: str,
+    plan: list[tuple[Path, str, Reader]],
+    out: Path,
+    *,
+    progress: Progress | None,
+    settings: Mapping[str, object],
 ) -> IngestResult:
-    """Read every input, put the rows together and write the table."""
+    """Read every input, put the rows together, write the table and, last, its manifest."""
     skipped: Counter[str] = Counter()
     found: Counter[str] = Counter()
     tables = []
@@ -171,6 +183,13 @@ def _ingest(
         progress(len(plan), len(plan))
     kinds = {name or "unknown": n for name, n in Counter(table[kind].to_pylist()).most_common()}
     formats = {str(path): file_format for path, file_format, _ in plan}
+    write_manifest(
+        Path(out),
+        step=f"ingest {schema.name}",
+        inputs=[path for path, *_ in plan],
+        settings=settings,
+        counts={"rows": table.num_rows, "by_kind": kinds, "found": dict(found), "skipped": dict(skipped)},
+    )
     return IngestResult(schema.name, Path(out), table.num_rows, kinds, dict(found), dict(skipped), formats)
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
@@ -19,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
 RAW_PREFIX = "raw:"
@@ -108,7 +109,9 @@ class Taxonomy:
         lands = [country] * len(codes) if country is None or isinstance(country, str) else list(country)
         found = [_meaning(code, land or "", scheme or "") for code, land in zip(codes, lands, strict=True)]
         return Classified(
-            *(np.array([getattr(m, name) for m in found], object) for name in ("concept", "group", "kind")),
+            concept=np.array([m.concept for m in found], object),
+            group=np.array([m.group for m in found], object),
+            kind=np.array([m.kind for m in found], object),
             value=np.array([np.nan if m.value is None else m.value for m in found], np.float64),
             unit=np.array([m.unit for m in found], object),
             sign_class=np.array([m.sign_class for m in found], object),
