@@ -342,19 +342,19 @@ def _manifest(result: SimulateResult, signs: Path, drive: Path, config: Config, 
 def _load_study(signs: Path, drive: Path, config: Config) -> _Study:
     sensor = SensorModel(**config.sensor.model_dump(exclude={"sensor_kind"}))
     road = load_drive(drive)
-    scene = load_scene(signs, road, **config.scene.model_dump(), cell_m=sensor.range_m)
-    if len(scene.classes) == 1 and sensor.semantic_rate < 1:
-        raise ConfigError(
-            f"semantic_rate = {sensor.semantic_rate} confuses classes, but all {len(scene.sign_ids)} signs of the "
-            f"scene are {scene.classes[0]}.",
-            where=str(signs),
-            todo="Set semantic_rate to 1, or widen corridor_m or groups.",
-        )
     fleet = config.fleet
     try:
         base = resample(road.line, spacing_m=fleet.frame_spacing_m, heading_baseline_m=fleet.heading_baseline_m)
     except InputError as error:
         raise InputError(error.what, where=str(drive), todo=error.todo) from None
+    scene = load_scene(signs, road, **config.scene.model_dump(), cell_m=sensor.range_m)
+    if len(scene.classes) == 1 and sensor.semantic_rate < 1:
+        raise ConfigError(
+            f"semantic_rate = {sensor.semantic_rate:g} confuses classes, but the scene has only one: "
+            f"{scene.classes[0]}.",
+            where=str(signs),
+            todo="Set semantic_rate to 1, or widen corridor_m or groups.",
+        )
     tracker = TrackerModel(**config.tracking.model_dump(), range_m=sensor.range_m, half_fov_rad=sensor.half_fov_rad)
     return _Study(config, road, scene, base, sensor, tracker)
 
@@ -367,7 +367,9 @@ def _check_numbers(**numbers: int) -> None:
 
 
 def _check_out(out: Path) -> None:
-    """Refuse to replace a folder that holds anything but an earlier simulation."""
+    """Refuse to replace a file, or a folder that holds anything but an earlier simulation."""
+    if out.is_file():
+        raise InputError("this is a file, and a folder is to be written.", where=str(out), todo="Give a folder.")
     strange = sorted({p.name for p in out.iterdir()} - _OUTPUTS) if out.is_dir() else []
     if strange:
         raise InputError(
