@@ -21,31 +21,30 @@ def match_within(a_xy_m: Floats, b_xy_m: Floats, gate_m: float) -> Ints:
     """Return for every point of `a` its partner in `b`, or `NONE`: optimal one-to-one under a gate.
 
     Only pairs nearer than the gate (strictly) are allowed; of all one-to-one assignments of them the one with the
-    most pairs is taken and, of those, the one with the least total distance. Where pairs contest nobody that is all of
-    them; otherwise the Hungarian method decides.
+    most pairs is taken and, of those, the one with the least total distance. Where the nearest partners of all points
+    are different ones, that is it; otherwise the Hungarian method decides.
     """
     n_a, n_b = len(a_xy_m), len(b_xy_m)
     start, column, distance = np.zeros(n_a + 1, np.int64), np.empty(n_a * n_b, np.int64), np.empty(n_a * n_b)
-    b_degree = np.zeros(n_b, np.int64)
-    n_pairs, contested = 0, False
+    partner, is_taken = np.full(n_a, NONE), np.zeros(n_b, np.bool_)
+    n_pairs, is_contested = 0, False
     for i in range(n_a):
+        nearest = gate_m
         for j in range(n_b):
             dx, dy = a_xy_m[i, 0] - b_xy_m[j, 0], a_xy_m[i, 1] - b_xy_m[j, 1]
             if dx * dx + dy * dy < gate_m * gate_m:
                 column[n_pairs], distance[n_pairs] = j, np.sqrt(dx * dx + dy * dy)
+                if distance[n_pairs] < nearest or partner[i] == NONE:
+                    nearest, partner[i] = distance[n_pairs], j
                 n_pairs += 1
-                b_degree[j] += 1
-                contested |= b_degree[j] > 1
         start[i + 1] = n_pairs
-        contested |= n_pairs - start[i] > 1
-    if contested:
+        if partner[i] != NONE:
+            is_contested |= is_taken[partner[i]]
+            is_taken[partner[i]] = True
+    if is_contested:
         # one pair less never pays: to stay out costs more than all pairs of an assignment together
         stay_out = np.full(n_a, gate_m * (min(n_a, n_b) + 1))
         return _assign(_Graph(start, column[:n_pairs], distance[:n_pairs], stay_out), n_b)
-    partner = np.full(n_a, NONE)
-    for i in range(n_a):
-        if start[i + 1] > start[i]:
-            partner[i] = column[start[i]]
     return partner
 
 
@@ -67,7 +66,7 @@ def associate(  # noqa: PLR0917 - numba takes no keyword-only arguments
     `frame_start[f]` is the first detection of frame f, with the total at the end; poses are those reported.
     """
     track = np.empty(len(xy_m), dtype=np.int64)
-    reference, n_seen = np.empty((len(xy_m), 2)), np.zeros(len(xy_m), dtype=np.int64)
+    reference, n_seen = np.zeros((len(xy_m), 2)), np.zeros(len(xy_m), dtype=np.int64)
     last_frame = np.empty(len(xy_m), dtype=np.int64)
     live, n_live, n_tracks = np.empty(len(xy_m), dtype=np.int64), 0, 0
     for frame in range(len(frame_start) - 1):
@@ -86,8 +85,9 @@ def associate(  # noqa: PLR0917 - numba takes no keyword-only arguments
             t = track[i] = taken[i - first]
             n_seen[t] += 1
             last_frame[t] = frame
-            weight = 1.0 / n_seen[t] if use_mean and n_seen[t] > 1 else 1.0
-            reference[t] = xy_m[i] if weight == 1.0 else reference[t] + weight * (xy_m[i] - reference[t])
+            share = 1.0 / n_seen[t] if use_mean else 1.0
+            for axis in range(2):  # one number at a time: array expressions would allocate
+                reference[t, axis] = (1.0 - share) * reference[t, axis] + share * xy_m[i, axis]
         if end_on_leaving_view:
             n_live = _still_in_view(
                 live, n_live, last_frame, frame, reference, pose_xy_m[frame], heading_rad[frame], range_m, half_fov_rad
