@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 
 from geofleet.formats.osm_roads import LEFT_HAND, Roads, facing_of, nearest_road
-from geofleet.formats.osm_scan import SignNodes, detect, explained, open_osm, read_roads, sign_nodes
+from geofleet.formats.osm_scan import SignNodes, detect, explained, open_osm, read_roads, refuse_lanelet2, sign_nodes
 from geofleet.formats.osm_tags import is_sign_key, node_signs
 from geofleet.formats.reading import LayerRead
 from geofleet.tables.schemas import LANES, SIGNS
@@ -71,6 +71,8 @@ def read_signs(path: Path, *, roads: bool = True) -> LayerRead:
     with explained(path):
         nodes = sign_nodes(file)
         ways = read_roads(file) if roads else None
+    if not len(nodes.node_id):
+        refuse_lanelet2(path)
     signs, skipped = _signs(nodes)
     facing = np.array([np.nan if f is None else f for f in signs.column("facing_deg")], np.float64)
     found = {
@@ -96,6 +98,8 @@ def read_lanes(path: Path) -> LayerRead:
     file = open_osm(path)
     with explained(path):
         ways = read_roads(file)
+    if not len(ways.way_id):
+        refuse_lanelet2(path)
     columns = {
         "lane_id": [f"w{way}" + (f"-{n}" if n else "") for way, n in zip(ways.way_id, ways.part, strict=True)],
         "road_id": [f"w{way}" for way in ways.way_id],

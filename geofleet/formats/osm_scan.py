@@ -5,6 +5,7 @@ Filters run in C++, so Python sees what is kept and little else; memory grows wi
 
 from __future__ import annotations
 
+import re
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 _PBF_MARK = b"OSMHeader"
 _MARK_WITHIN = 1024
+_LANELET = re.compile(rb"""v=["']lanelet["']""")
+_CHUNK, _OVERLAP = 1 << 20, 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +78,33 @@ def explained(path: Path) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(error.what, where=str(path), todo=error.todo) from None
-    except (RuntimeError, ValueError, OSError, OverflowError, MemoryError) as error:
+    except (osmium.InvalidLocationError, RuntimeError, ValueError, OSError, OverflowError, MemoryError) as error:
         reason = str(error).strip().rstrip(".") or type(error).__name__
         raise InputError(
             f"damaged, or not an OpenStreetMap file ({reason}).",
             where=str(path),
             todo="Fetch or export it again.",
         ) from None
+
+
+def refuse_lanelet2(path: Path) -> None:
+    """Refuse a Lanelet2 map, which is OpenStreetMap XML in form only; asked when a file gave nothing.
+
+    Raises
+    ------
+    InputError
+        The file holds lanelets.
+    """
+    with path.open("rb") as file:
+        tail = b""
+        while chunk := file.read(_CHUNK):
+            if _LANELET.search(tail + chunk):
+                raise InputError(
+                    "a Lanelet2 map, which is not read.",
+                    where=str(path),
+                    todo="Give an OpenStreetMap extract: .osm.pbf, .osm, .osm.gz or .osm.bz2.",
+                )
+            tail = chunk[-_OVERLAP:]
 
 
 def sign_nodes(file: osmium.io.File) -> SignNodes:

@@ -25,7 +25,7 @@ _SLOTS = ("", *(f":{n}" for n in range(1, 13)))
 _SIDES = ("", ":forward", ":backward", ":both")
 SIGN_KEYS = tuple(f"traffic_sign{slot}{side}" for slot in _SLOTS for side in _SIDES)
 _SIGN_KEY = re.compile(r"traffic_sign(?::(?P<slot>\d+))?(?::(?P<side>forward|backward|both))?")
-_COUNTRY = re.compile(r"(?:([A-Za-z]{2}):\s*)?(.*)", re.DOTALL)
+_COUNTRY = re.compile(r"(?:([A-Za-z]{2}):\s*(?=\S))?(.*)", re.DOTALL)
 _NUMBER = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*°?\s*")
 _SPEED = re.compile(r"\s*(\d+(?:[.,]\d+)?)\s*(km/h|kmh|kph|mph|knots)?\s*")
 _KMH = {"mph": 1.609344, "knots": 1.852}

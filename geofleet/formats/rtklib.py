@@ -32,6 +32,7 @@ WEEK_S = 604_800.0
 ROLLOVER_WEEKS = 1024
 _RECENT_WEEKS = 2048  # the count of ten bits began again on 2019-04-07
 _JST_S = 9 * 3600.0
+_LONGEST_S = 1e11  # three thousand years; what is longer is no time
 _N_COLUMNS = 32
 _MAX_LAT, _MAX_LON = 90.0, 180.0
 
@@ -48,7 +49,8 @@ _LEAPS_IN_GPST = LEAP_DAYS + np.arange(1, len(LEAP_DAYS) + 1).astype("timedelta6
 
 _DATED = re.compile(rb"\s*\d{4}/\d{1,2}/\d{1,2}[\s,;]+\d{1,2}:\d{2}:\d")
 _WEEKLY = re.compile(rb"\s*\d{1,4}[\s,;]+\d{1,6}\.\d+[\s,;]+-?\d{1,3}\.\d+[\s,;]+-?\d{1,3}\.\d+[\s,;]")
-_HEADER_DATE = re.compile(r"(?:obs|sol) start\s*:\s*(\d{4})/(\d{2})/(\d{2})")
+_HEADER_MARKS = (b"RTKLIB", b"RTKPOST", b"% program", b"Q=1:fix", b"latitude", b"-ecef(m)", b"-baseline(m)")
+_HEADER_DATE = re.compile(r"(?:obs|sol) start\s*:\s*(\d{4}/\d{2}/\d{2})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +101,7 @@ def detect(head: bytes) -> bool:
     """Tell whether a file's first bytes are an RTKLIB solution's: its header, or epochs without one."""
     lines = head.split(b"\n")
     if any(line.startswith(b"%") for line in lines):
-        return b"RTKLIB" in head or b"latitude" in head or b"Q=1:fix" in head or b"% program" in head
+        return any(mark in head for mark in _HEADER_MARKS)
     first = next((line for line in lines if line.strip()), b"")
     return bool(_DATED.match(first) or _WEEKLY.match(first))
 
@@ -165,13 +167,14 @@ def _header(lines: list[str]) -> _Header:
     words = titles.lstrip("% ").replace(",", " ").split()
     system = words[0].upper() if words and words[0].upper() in {"GPST", "UTC", "JST"} else "GPST"
     date = _HEADER_DATE.search(text)
+    start = pd.to_datetime(date[1] if date else "", format="%Y/%m/%d", errors="coerce")
     return _Header(
         system=system,
         is_baseline="baseline(m)" in text or "e/n/u-baseline" in text,
         is_ecef="x-ecef" in text or "x/y/z-ecef" in text,
         is_sexagesimal="latitude(d'" in titles,
         is_derived=any("program" in line and DERIVED in line for line in lines),
-        start=np.datetime64("-".join(date.groups()), "us") if date else None,
+        start=None if start is pd.NaT else start.to_datetime64(),
     )
 
 
@@ -260,6 +263,6 @@ def _rollovers(week: Floats, header: _Header) -> Floats:
 
 
 def _microseconds(seconds: Floats) -> NDArray[np.timedelta64]:
-    whole = np.where(np.isnan(seconds), 0.0, seconds)
-    span = np.round(whole * 1e6).astype("timedelta64[us]")
-    return np.where(np.isnan(seconds), np.timedelta64("NaT", "us"), span)
+    usable = np.abs(seconds) < _LONGEST_S
+    span = np.round(np.where(usable, seconds, 0.0) * 1e6).astype("timedelta64[us]")
+    return np.where(usable, span, np.timedelta64("NaT", "us"))

@@ -1,0 +1,196 @@
+from __future__ import annotations
+
+import random
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from geofleet.errors import InputError
+from geofleet.formats.drives import jumps, motion_of, read_drive
+from geofleet.formats.rtklib import LEAP_DAYS, gpst_to_utc
+from geofleet.tables.store import lonlat
+
+TITLE = "%  {}                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)\n"
+TAIL = "  100.0   1   9   0.0100   0.0200   0.0300   0.0   0.0   0.0   0.00    3.0\n"
+
+
+def pos(tmp_path, text, name="drive.pos"):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def rows(times, lats=None, lon=10.0, tail=TAIL):
+    lats = lats or [50.0 + i * 1e-4 for i in range(len(times))]
+    return "".join(f"{t}   {lat:.9f}  {lon:.9f}{tail}" for t, lat in zip(times, lats, strict=True))
+
+
+def first_time(path):
+    return read_drive(path).table["t_utc"][0].as_py()
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "quality", "gaps"),
+    [
+        ("nagoya/reference_1Hz.pos", 1231, {"fixed"}, 0),
+        ("nagoya/rover_rtk.pos", 5393, {"fixed", "float"}, 13),
+        ("nagoya/rover_1Hz_spp.pos", 542, {"single"}, None),
+        ("nagoya/static_rover_rtk.pos", 301, {"fixed"}, 0),
+        ("colorado/demo5_b34f_f.pos", 4521, {"fixed", "float"}, 0),
+        ("colorado/gnss_1934_sf.pos", 2197, {"fixed", "float"}, 0),
+    ],
+)
+def test_real_solutions(shared_data, name, n, quality, gaps):
+    layer = read_drive(shared_data / "trajectory" / name)
+    assert layer.table.num_rows == n
+    assert set(layer.table["fix_quality"].to_pylist()) == quality
+    assert gaps is None or layer.found["gaps"] == gaps
+    assert layer.table["seq"].to_pylist() == list(range(n))
+
+
+def test_two_headers_of_one_drive_give_one_time(shared_data):
+    by_week = first_time(shared_data / "trajectory" / "nagoya" / "rover_rtk.pos")
+    by_date = first_time(shared_data / "trajectory" / "nagoya" / "reference_1Hz.pos")
+    assert by_week == by_date == datetime(2023, 7, 11, 6, 4, 12, tzinfo=UTC)  # 06:04:30 GPST
+
+
+def test_the_length_of_a_real_drive(shared_data):
+    table = read_drive(shared_data / "trajectory" / "nagoya" / "reference_1Hz.pos").table
+    speed = np.array(table["speed_mps"].to_pylist())
+    assert speed.sum() == pytest.approx(4180, rel=0.01)
+
+
+def test_a_parked_car_has_no_heading(shared_data):
+    layer = read_drive(shared_data / "trajectory" / "nagoya" / "static_rover_rtk.pos")
+    assert layer.table["heading_deg"].null_count == 301
+    assert layer.found["epochs standing still"] == 301
+
+
+def test_a_baseline_solution_is_refused_with_the_reason(shared_data):
+    with pytest.raises(InputError, match=r"baseline.*out-solformat=llh"):
+        read_drive(shared_data / "trajectory" / "misc" / "demo1_out.pos")
+
+
+def test_an_earth_centred_solution_is_refused(tmp_path):
+    text = "%  GPST   x-ecef(m)  y-ecef(m)  z-ecef(m)   Q  ns\n" + rows(["2023/07/11 06:04:30.000"])
+    with pytest.raises(InputError, match="Earth-centred"):
+        read_drive(pos(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("head", "time", "expected"),
+    [
+        (TITLE.format("GPST"), "2023/07/11 06:04:30.000", datetime(2023, 7, 11, 6, 4, 12, tzinfo=UTC)),
+        (TITLE.format("UTC"), "2023/07/11 06:04:30.000", datetime(2023, 7, 11, 6, 4, 30, tzinfo=UTC)),
+        (TITLE.format("JST"), "2023/07/11 06:04:30.000", datetime(2023, 7, 10, 21, 4, 30, tzinfo=UTC)),
+        (TITLE.format("GPST"), "2270 194670.000", datetime(2023, 7, 11, 6, 4, 12, tzinfo=UTC)),
+        (
+            "% obs start : 2023/07/11 06:04:30.0 GPST\n" + TITLE.format("GPST"),
+            "222 194670.000",
+            datetime(2023, 7, 11, 6, 4, 12, tzinfo=UTC),
+        ),
+        (
+            "% obs start : 2018/07/11 06:04:30.0 GPST\n" + TITLE.format("GPST"),
+            "985 194670.000",
+            datetime(2018, 7, 10, 6, 4, 12, tzinfo=UTC),
+        ),
+        (TITLE.format("GPST"), "2010/01/01 00:00:60.000", datetime(2010, 1, 1, 0, 0, 45, tzinfo=UTC)),
+        ("", "2023/07/11 06:04:30.000", datetime(2023, 7, 11, 6, 4, 12, tzinfo=UTC)),
+        ("", "2023/07/11,06:04:30.000,", datetime(2023, 7, 11, 6, 4, 12, tzinfo=UTC)),
+    ],
+)
+def test_times_of_every_header(tmp_path, head, time, expected):
+    assert first_time(pos(tmp_path, head + rows([time]))) == expected
+
+
+def test_leap_seconds_begin_on_their_day():
+    assert len(LEAP_DAYS) == 18
+    utc = np.array(["2016-12-31T23:59:58", "2017-01-01T00:00:00"], "datetime64[us]")
+    gpst = utc + np.array([17, 18], "timedelta64[s]")
+    np.testing.assert_array_equal(gpst_to_utc(gpst), utc)
+
+
+def test_degrees_minutes_and_seconds(tmp_path):
+    text = "%  GPST   latitude(d'\") longitude(d'\")  height(m)   Q  ns\n"
+    text += f"2023/07/11 06:04:30.000  -35 09 55.2999  -136 52 53.0711 {TAIL}"
+    lon, lat = lonlat(read_drive(pos(tmp_path, text)).table)
+    assert (lon[0], lat[0]) == pytest.approx((-136.8814086, -35.1653611), abs=1e-6)
+
+
+def test_columns_of_quality_height_and_sigma(tmp_path):
+    text = TITLE.format("GPST") + "2023/07/11 06:04:30.0 50.0 10.0 123.4 4.0000 9.0 0.01 0.02 0.03\n"
+    row = read_drive(pos(tmp_path, text)).table.to_pylist()[0]
+    assert (row["height_m"], row["fix_quality"]) == (123.4, "dgps")
+    assert (row["sigma_n_m"], row["sigma_e_m"]) == (0.01, 0.02)
+    assert row["drive_id"] == "drive"
+
+
+def test_gaps_duplicates_disorder_and_bad_lines_are_counted(tmp_path):
+    seconds = [0, 1, 2, 2, 4, 3, 30, 31]
+    times = [f"2023/07/11 06:04:{s:02d}.000" for s in seconds]
+    text = TITLE.format("GPST") + rows(times, [50 + s * 1e-4 for s in seconds])
+    text += "garbage\n2023/07/11 06:04:32.000 95.0 10.0 1 1 1\n2023/13/11 06:04:33.000 50.0 10.0 1 1 1\n"
+    layer = read_drive(pos(tmp_path, text))
+    assert layer.table["segment"].to_pylist() == [0] * 5 + [1] * 2
+    assert layer.found["gaps"] == 1
+    assert layer.found["epochs out of order"] == 1
+    assert layer.skipped == {"lines that are no epoch": 2, "epochs without a valid position": 1, "duplicate epochs": 1}
+
+
+def test_motion_of_a_drive_north_then_east():
+    lat = np.array([50.0, 50.0001, 50.0002, 50.0002, 50.0002])
+    lon = np.array([10.0, 10.0, 10.0, 10.0002, 10.0002])
+    motion = motion_of(np.arange(5.0), lon, lat)
+    assert motion.heading_deg[:2] == pytest.approx([0.0, 0.0], abs=1e-6)
+    assert motion.heading_deg[3:] == pytest.approx(
+        [90.0, 90.0], abs=1e-3
+    )  # the last epoch stands and keeps its heading
+    assert motion.speed_mps[0] == pytest.approx(11.12, abs=0.01)
+    assert motion.speed_mps[4] == pytest.approx(0.0)
+
+
+def test_motion_of_one_epoch_is_unknown(tmp_path):
+    row = read_drive(pos(tmp_path, rows(["2023/07/11 06:04:30.000"]))).table.to_pylist()[0]
+    assert (row["heading_deg"], row["speed_mps"], row["segment"]) == (None, None, 0)
+
+
+def test_a_single_wrong_fix_is_a_jump_and_a_curve_is_not():
+    t = np.arange(20.0) / 5
+    lat = 50.0 + t * 1e-4
+    lon = 10.0 + np.sin(t) * 1e-5
+    assert not jumps(t, lon, lat).any()
+    lon[10] += 41.8 / 71_000
+    assert np.flatnonzero(jumps(t, lon, lat)).tolist() == [10]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "the file is empty"),
+        (b"hello\n", "not an RTKLIB solution"),
+        (b"lat,lon\n50,10\n", "not an RTKLIB solution"),
+        (b"% program   : RTKLIB\n", "holds no epoch"),
+        (b"% program   : RTKLIB\n1 2 3\n", "holds no epoch"),
+    ],
+)
+def test_what_is_no_solution_is_refused(tmp_path, content, message):
+    path = tmp_path / "drive.pos"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_drive(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_damage_gives_an_input_error_or_a_drive(repo, tmp_path, seed):
+    draw = random.Random(seed)  # noqa: S311 - not a secret
+    content = bytearray((repo / "data" / "raw" / "helsinki_derived.pos").read_bytes()[:6000])
+    for _ in range(draw.randint(1, 30)):
+        content[draw.randrange(len(content))] ^= 1 << draw.randrange(8)
+    path = tmp_path / "damaged.pos"
+    path.write_bytes(content)
+    try:
+        assert read_drive(path).table.num_rows > 0
+    except InputError as error:
+        assert str(path) in str(error)  # noqa: PT017 - either outcome is right
