@@ -1,69 +1,129 @@
 """Evaluate: match a map to its reference, one to one, and score it.
 
-Reads two layers of signs; writes `matches` and `scores` and the same as GeoJSON for GIS tools.
+Reads two layers of signs; writes `matches` and `scores`, tables of them as CSV, and layers for GIS tools.
 """
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from geofleet.algorithms.geodesy import to_ecef
-from geofleet.algorithms.matching import Matching, match_points
-from geofleet.algorithms.metrics import MapScore, derive_scores, null_reason
-from geofleet.algorithms.tiling import quadkey_bounds, quadkeys
+from geofleet.algorithms.extent import is_within_reach
+from geofleet.algorithms.metrics import MapScore
 from geofleet.errors import ConfigError
-from geofleet.formats.geojson import write_geojson
 from geofleet.formats.layers import read_layer
-from geofleet.tables.database import connect, run
+from geofleet.formats.results import write_csv, write_result_layers
 from geofleet.tables.manifest import write_manifest
-from geofleet.tables.schemas import BBOX, MATCHES, SCORES
-from geofleet.tables.store import atomic_path, build_table, lonlat, to_geodataframe, write_table
+from geofleet.tables.matching import class_confusion, match_layers, match_signs
+from geofleet.tables.schemas import BBOX, GEOMETRY, MATCHES, REFERENCE, SCORES
+from geofleet.tables.scoring import (
+    missed_requirements,
+    parse_requirements,
+    score_matches,
+    score_row,
+    summarise_scores,
+)
+from geofleet.tables.store import atomic_path, lonlat, read_table, write_table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from geopandas import GeoDataFrame
+    from numpy.typing import NDArray
 
+    from geofleet.algorithms.metrics import MatchOn
     from geofleet.config import Config, EvaluateConfig
 
-_REQUIREMENT = re.compile(r"^\s*([a-z_0-9]+)\s*(<=|>=|<|>|==)\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*$")
-_SHORTEST_LINE_M = 0.002  # GeoJSON is written to a millimetre: anything shorter could come out without length
-_COMPARE = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal, "==": np.equal}
+    Ints = NDArray[np.int64]
 
+__all__ = [
+    "EvaluateResult",
+    "evaluate",
+    "missed_requirements",
+    "parse_requirements",
+    "score_layers",
+    "score_matches",
+]
 
-_SCORE_NAMES = tuple(c.name for c in SCORES.columns if c.name in ("tp", "fp", "fn") or pa.types.is_floating(c.type))
-
-
-@dataclass(frozen=True, slots=True)
-class Requirement:
-    """A bound on a score, e.g. `gospa_m < 0.8`."""
-
-    text: str
-    score: str
-    operator: str
-    bound: float
+CLIP_M = 100.0  # signs of a town stand 7 to 30 m apart: 100 m without one is a place that the map does not cover
+_LABELS = ("run_id", "method", "n_vehicles")
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluateResult:
-    """What an evaluation found: the rows over all tiles and concepts, one a run, method and fleet size."""
+    """What an evaluation found, and the files that hold it.
+
+    Parameters
+    ----------
+    out
+        The folder written.
+    totals
+        Rows of `scores` over all tiles and concepts, one a run, method and fleet size.
+    files
+        Everything in the folder but the manifest.
+    tiles, concepts
+        Rows of `scores` a tile and a concept.
+    confusion
+        How often a reference class stands in the map as which class, of signs that match by position.
+    sources
+        Scores of every source of the map alone, when it has several.
+    summary
+        Mean, standard deviation and number of nulls of every score over the runs.
+    counts
+        Signs left out by `--clip` and `--in-view`, and signs without an error ellipse.
+    """
 
     out: Path
     totals: tuple[dict[str, Any], ...]
     files: tuple[Path, ...]
+    tiles: tuple[dict[str, Any], ...] = ()
+    concepts: tuple[dict[str, Any], ...] = ()
+    confusion: tuple[dict[str, Any], ...] = ()
+    sources: tuple[dict[str, Any], ...] = ()
+    summary: tuple[dict[str, Any], ...] = ()
+    counts: dict[str, int] = field(default_factory=dict)
 
 
-def evaluate(map_path: Path, reference_path: Path, out: Path, *, config: Config) -> EvaluateResult:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """One map and its reference: labels, the rows of either layer that are scored, and their signs."""
+
+    labels: dict[str, Any]
+    rows: Ints
+    ref_rows: Ints
+    fused: pa.Table
+    reference: pa.Table
+
+
+def evaluate(
+    map_path: Path,
+    reference_path: Path,
+    out: Path,
+    *,
+    config: Config,
+    clip_m: float | None = None,
+    in_view: bool = False,
+) -> EvaluateResult:
     """Score the main signs of a map against those of a reference and write tables and GIS layers.
 
     Every run in the map is matched to the reference signs of the same run; a reference without runs serves every run.
+
+    Parameters
+    ----------
+    map_path, reference_path
+        Layers of signs, in any format that `read_layer` knows.
+    out
+        Folder to write.
+    config
+        Its section `evaluate`, and `tile_zoom`.
+    clip_m
+        Score only signs with a sign of the other layer within this distance, metres; all signs by default.
+    in_view
+        Score only reference signs that some pass had in view; the reference must be a `reference` table.
 
     Raises
     ------
@@ -73,29 +133,53 @@ def evaluate(map_path: Path, reference_path: Path, out: Path, *, config: Config)
         The map and the reference have no run in common.
     """
     gate_m, match_on = config.evaluate.gate_m, config.evaluate.match_on
-    map_, reference = _main_signs(read_layer(map_path)), _main_signs(read_layer(reference_path))
-    parts = [
-        _match_layer(fused, ref, labels, gate_m=gate_m, match_on=match_on, tile_zoom=config.aggregate.tile_zoom)
-        for labels, fused, ref in _pairs(map_, reference)
-    ]
-    matches = pa.concat_tables(parts)
+    map_ = _main_signs(read_layer(map_path))
+    whole = _main_signs(read_table(REFERENCE, reference_path) if in_view else read_layer(reference_path))
+    reference = whole.filter(pc.field("n_passes_in_view") > 0) if in_view else whole
+    pairs = list(_pairs(map_, reference, clip_m=clip_m))
+    matches = pa.concat_tables(
+        match_layers(
+            pair.fused,
+            pair.reference,
+            pair.labels,
+            gate_m=gate_m,
+            match_on=match_on,
+            tile_zoom=config.aggregate.tile_zoom,
+        )
+        for pair in pairs
+    )
     scores = score_matches(matches, gate_m=gate_m, match_on=match_on)
-    with atomic_path(out) as draft:
-        draft.mkdir()
-        write_table(MATCHES, matches, draft / "matches.parquet")
-        write_table(SCORES, scores, draft / "scores.parquet")
-        _write_layers(draft, map_, reference, matches, scores)
-        names = sorted(path.name for path in draft.iterdir())
-    totals = tuple(scores.filter((pc.field("tile") == "all") & (pc.field("concept") == "all")).to_pylist())
+    used, ref_used = _used_rows(pairs, map_.num_rows, reference.num_rows)
+    layers = {
+        "fused": map_.filter(used),
+        "labels": _labels(map_).filter(used),
+        "reference": reference.filter(ref_used),
+        "matches": matches,
+        "scores": scores,
+    }
+    more = {
+        **_rows_of_parts(scores),
+        "confusion": _confusion(pairs, gate_m=gate_m),
+        "sources": _score_sources(pairs, gate_m=gate_m, match_on=match_on),
+        "summary": summarise_scores(_totals(scores)),
+    }
+    files, n_without = _write(out, layers, more)
+    counts = {
+        "map_signs_clipped": map_.num_rows - layers["fused"].num_rows,
+        "reference_signs_clipped": reference.num_rows - layers["reference"].num_rows,
+        "reference_signs_never_in_view": whole.num_rows - reference.num_rows,
+        "map_signs_without_ellipse": n_without,
+    }
     write_manifest(
         out,
         step="evaluate",
         inputs=(map_path, reference_path),
         config_digest=config.digest("evaluate"),
-        settings=config.evaluate.model_dump(),
-        counts={"matches": matches.num_rows, "scores": scores.num_rows},
+        settings=config.evaluate.model_dump() | {"clip_m": clip_m, "in_view": in_view},
+        counts={"matches": matches.num_rows, "scores": scores.num_rows, **counts},
     )
-    return EvaluateResult(out, totals, tuple(out / name for name in names))
+    rows = {name: tuple(part) for name, part in more.items()}
+    return EvaluateResult(out=out, totals=_totals(scores), files=files, counts=counts, **rows)
 
 
 def score_layers(map_: pa.Table, reference: pa.Table, *, config: EvaluateConfig) -> MapScore:
@@ -111,67 +195,20 @@ def score_layers(map_: pa.Table, reference: pa.Table, *, config: EvaluateConfig)
         if n_groups > 1:
             raise ConfigError(f"the {name} holds {n_groups} runs, methods or fleet sizes.", todo="Score one at a time.")
     fused, ref = _main_signs(map_), _main_signs(reference)
-    matching = _match_signs(fused, ref, gate_m=config.gate_m, match_on=config.match_on)
+    return _score(fused, ref, gate_m=config.gate_m, match_on=config.match_on)
+
+
+def _score(fused: pa.Table, ref: pa.Table, *, gate_m: float, match_on: MatchOn) -> MapScore:
+    matching = match_signs(fused, ref, gate_m=gate_m, match_on=match_on)
     return MapScore(
         tp=len(matching),
         fp=fused.num_rows - len(matching),
         fn=ref.num_rows - len(matching),
         sum_sq_error_m2=matching.sum_sq_error_m2,
-        gate_m=config.gate_m,
-        match_on=config.match_on,
+        gate_m=gate_m,
+        match_on=match_on,
         matches=matching,
     )
-
-
-def score_matches(matches: pa.Table, *, gate_m: float, match_on: str) -> pa.Table:
-    """Return the `scores` table of a `matches` table: per tile, per concept, both, and in total."""
-    connection = connect()
-    connection.register("matches", matches)
-    counts = run(connection, "evaluate/counts").to_arrow_table()
-    connection.close()
-    numbers = [counts[name].to_numpy() for name in ("tp", "fp", "fn", "sum_sq_error_m2")]
-    columns = {name: counts[name] for name in counts.column_names}
-    columns |= derive_scores(*numbers, gate_m=gate_m)
-    reasons = [null_reason(tp, fp, fn) for tp, fp, fn in zip(*(n.tolist() for n in numbers[:3]), strict=True)]
-    tiles = counts["tile"].to_pylist()
-    return build_table(
-        SCORES,
-        columns | {"gate_m": gate_m, "match_on": match_on, "null_reason": pa.array(reasons, pa.string())},
-        geometry=_tile_polygons(tiles),
-    )
-
-
-def parse_requirements(texts: Sequence[str]) -> list[Requirement]:
-    """Read requirements like `gospa_m<0.8`.
-
-    Raises
-    ------
-    ConfigError
-        A text is not `score operator number`, or names no score.
-    """
-    parsed = []
-    for text in texts:
-        match = _REQUIREMENT.match(text)
-        if not match or match[1] not in _SCORE_NAMES:
-            raise ConfigError(
-                f"{text!r} is not a requirement.",
-                where="--require",
-                todo=f'Example: "gospa_m<0.8"; scores are {", ".join(_SCORE_NAMES)}.',
-            )
-        parsed.append(Requirement(text.strip(), match[1], match[2], float(match[3])))
-    return parsed
-
-
-def missed_requirements(totals: Sequence[dict[str, Any]], requirements: Sequence[Requirement]) -> list[str]:
-    """Return a sentence for every requirement that a total misses; a score that is null misses it."""
-    missed = []
-    for need in requirements:
-        for total in totals:
-            value = total[need.score]
-            if value is None or not _COMPARE[need.operator](value, need.bound):
-                shown = f"null ({total['null_reason']})" if value is None else f"{value:.6g}"
-                missed.append(f"{need.text} is missed by {total['method']}, {total['n_vehicles']} vehicles: {shown}.")
-    return missed
 
 
 def _main_signs(layer: pa.Table) -> pa.Table:
@@ -188,136 +225,114 @@ def _labels(layer: pa.Table) -> pa.Table:
     return pa.table({"run_id": run_id, "method": pc.fill_null(method, "given"), "n_vehicles": pc.fill_null(size, 0)})
 
 
-def _pairs(map_: pa.Table, reference: pa.Table) -> Iterator[tuple[dict[str, Any], pa.Table, pa.Table]]:
-    """Yield labels, map signs and reference signs of every run, method and fleet size, in sorted order.
+def _pairs(map_: pa.Table, reference: pa.Table, *, clip_m: float | None) -> Iterator[_Pair]:
+    """Yield every run, method and fleet size of the map with the reference signs of its run, in sorted order.
 
     A run of the reference that the map has nothing of is scored against an empty map.
     """
     labels, ref_runs = _labels(map_), _labels(reference)["run_id"]
-    runs = set(ref_runs.to_pylist())
-    groups = labels.group_by(["run_id", "method", "n_vehicles"]).aggregate([]).to_pylist()
-    if groups and None not in runs and not runs & {g["run_id"] for g in groups} and len(runs) > 1:
-        raise ConfigError(
-            f"the map belongs to none of the {len(runs)} runs of the reference.",
-            todo="Give the reference that the map's detections were simulated with.",
-        )
-    scored = {g["run_id"] for g in groups}
-    if None not in runs and None not in scored:
-        groups += [{"run_id": r, "method": "none", "n_vehicles": 0} for r in sorted(runs - scored)]
-    if not groups:
-        groups = [{"run_id": None, "method": "none", "n_vehicles": 0}]
-    for group in sorted(groups, key=lambda g: (g["run_id"] or "", g["method"], g["n_vehicles"])):
+    for group in _groups(labels, set(ref_runs.to_pylist())):
         same = pc.and_(
             pc.and_(pc.equal(labels["method"], group["method"]), pc.equal(labels["n_vehicles"], group["n_vehicles"])),
             _equal_or_null(labels["run_id"], group["run_id"]),
         )
-        own = (
-            reference
-            if group["run_id"] is None or None in runs
-            else reference.filter(pc.equal(ref_runs, group["run_id"]))
+        own = pc.or_(pc.is_null(ref_runs), _equal_or_null(ref_runs, group["run_id"]))
+        every = group["run_id"] is None or ref_runs.null_count > 0
+        rows = np.flatnonzero(same.to_numpy())
+        ref_rows = np.arange(reference.num_rows) if every else np.flatnonzero(own.to_numpy())
+        if clip_m is not None:
+            rows, ref_rows = _clip(map_, rows, reference, ref_rows, clip_m)
+        yield _Pair(group, rows, ref_rows, map_.take(pa.array(rows)), reference.take(pa.array(ref_rows)))
+
+
+def _groups(labels: pa.Table, ref_runs: set[str | None]) -> list[dict[str, Any]]:
+    """Return run, method and fleet size of every map to score."""
+    groups: list[dict[str, Any]] = labels.group_by(list(_LABELS)).aggregate([]).to_pylist()
+    if groups and None not in ref_runs and not ref_runs & {g["run_id"] for g in groups} and len(ref_runs) > 1:
+        raise ConfigError(
+            f"the map belongs to none of the {len(ref_runs)} runs of the reference.",
+            todo="Give the reference that the map's detections were simulated with.",
         )
-        yield group, map_.filter(same), own
+    scored = {g["run_id"] for g in groups}
+    if None not in ref_runs and None not in scored:
+        unseen = sorted(run for run in ref_runs - scored if run is not None)
+        groups += [{"run_id": run, "method": "none", "n_vehicles": 0} for run in unseen]
+    if not groups:
+        groups = [{"run_id": None, "method": "none", "n_vehicles": 0}]
+    return sorted(groups, key=lambda g: (g["run_id"] or "", g["method"], g["n_vehicles"]))
+
+
+def _clip(map_: pa.Table, rows: Ints, reference: pa.Table, ref_rows: Ints, clip_m: float) -> tuple[Ints, Ints]:
+    """Keep the rows in the common extent of a map and its reference."""
+    lon, lat = (side[rows] for side in lonlat(map_))
+    ref_lon, ref_lat = (side[ref_rows] for side in lonlat(reference))
+    kept = is_within_reach(lon, lat, of_lon_deg=ref_lon, of_lat_deg=ref_lat, reach_m=clip_m)
+    ref_kept = is_within_reach(ref_lon, ref_lat, of_lon_deg=lon, of_lat_deg=lat, reach_m=clip_m)
+    return rows[kept], ref_rows[ref_kept]
+
+
+def _used_rows(pairs: Sequence[_Pair], n_map: int, n_ref: int) -> tuple[pa.Array, pa.Array]:
+    """Return which rows of the map and of the reference are scored in any pair."""
+    used, ref_used = np.zeros(n_map, np.bool_), np.zeros(n_ref, np.bool_)
+    for pair in pairs:
+        used[pair.rows] = True
+        ref_used[pair.ref_rows] = True
+    return pa.array(used), pa.array(ref_used)
 
 
 def _equal_or_null(column: pa.ChunkedArray, value: str | None) -> pa.ChunkedArray:
     return pc.is_null(column) if value is None else pc.fill_null(pc.equal(column, value), fill_value=False)
 
 
-def _match_signs(fused: pa.Table, ref: pa.Table, *, gate_m: float, match_on: str) -> Matching:
-    """Match two layers of signs.
-
-    In Earth-centred coordinates a chord of metres is the distance on the ground to 1e-13, whatever the extent.
-    """
-    codes, ref_codes = _codes(fused, ref, match_on)
-    return match_points(to_ecef(*lonlat(fused)), to_ecef(*lonlat(ref)), gate_m=gate_m, codes=codes, ref_codes=ref_codes)
+def _totals(scores: pa.Table) -> tuple[dict[str, Any], ...]:
+    return tuple(scores.filter((pc.field("tile") == "all") & (pc.field("concept") == "all")).to_pylist())
 
 
-def _match_layer(
-    fused: pa.Table, ref: pa.Table, labels: dict[str, Any], *, gate_m: float, match_on: str, tile_zoom: int
-) -> pa.Table:
-    """Return the `matches` rows of one map and its reference."""
-    (lon, lat), (ref_lon, ref_lat) = lonlat(fused), lonlat(ref)
-    matching = _match_signs(fused, ref, gate_m=gate_m, match_on=match_on)
-    i, j, outcome, distance = _outcomes(matching, fused.num_rows, ref.num_rows)
-    here_lon = np.where(j >= 0, _take(ref_lon, j), _take(lon, i))
-    here_lat = np.where(j >= 0, _take(ref_lat, j), _take(lat, i))
-    columns: dict[str, Any] = {"fused_id": _pick(fused["sign_id"], i), "ref_id": _pick(ref["sign_id"], j)}
-    for column, name in (("sign_class", "class"), ("concept", "concept")):
-        columns[f"fused_{name}"] = _pick(fused[column], i)
-        columns[f"ref_{name}"] = _pick(ref[column], j)
-    columns |= {
-        "outcome": outcome,
-        "tile": quadkeys(here_lon, here_lat, tile_zoom),
-        "distance_m": pa.array(distance, from_pandas=True),
-        "class_agrees": pc.equal(columns["fused_class"], columns["ref_class"]),
+def _rows_of_parts(scores: pa.Table) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows a tile, over all concepts, and a concept, over all tiles."""
+    plain = scores.drop_columns([GEOMETRY, BBOX])
+    one_tile, one_concept = pc.field("tile") != "all", pc.field("concept") != "all"
+    return {
+        "tiles": plain.filter(one_tile & ~one_concept).to_pylist(),
+        "concepts": plain.filter(one_concept & ~one_tile).to_pylist(),
     }
-    return build_table(MATCHES, columns | labels, geometry=(here_lon, here_lat))
 
 
-def _codes(fused: pa.Table, ref: pa.Table, match_on: str) -> tuple[Any, Any]:
-    """Return integer codes of what must be equal in a match, or None twice."""
-    if match_on == "none":
-        return None, None
-    column = {"class": "sign_class", "concept": "concept"}[match_on]
-    both = pa.chunked_array([*fused[column].chunks, *ref[column].chunks], pa.string()).combine_chunks()
-    codes = both.dictionary_encode().indices.to_numpy(zero_copy_only=False)
-    return codes[: fused.num_rows], codes[fused.num_rows :]
+def _confusion(pairs: Sequence[_Pair], *, gate_m: float) -> list[dict[str, Any]]:
+    """Count which class of the map stands where the reference has which, whatever the scores match on."""
+    return [
+        pair.labels | row
+        for pair in pairs
+        for row in class_confusion(pair.fused, pair.reference, gate_m=gate_m).to_pylist()
+    ]
 
 
-def _outcomes(matching: Matching, n_map: int, n_ref: int) -> tuple[Any, Any, Any, Any]:
-    """Return row of the map, row of the reference (-1: none), outcome and distance: TP, then FP, then FN."""
-    false = np.setdiff1d(np.arange(n_map), matching.index)
-    missed = np.setdiff1d(np.arange(n_ref), matching.ref_index)
-    i = np.concatenate((matching.index, false, np.full(len(missed), -1)))
-    j = np.concatenate((matching.ref_index, np.full(len(false), -1), missed))
-    outcome = np.repeat(["TP", "FP", "FN"], (len(matching.index), len(false), len(missed)))
-    distance = np.concatenate((matching.distance_m, np.full(len(false) + len(missed), np.nan)))
-    return i, j, outcome, distance
+def _score_sources(pairs: Sequence[_Pair], *, gate_m: float, match_on: MatchOn) -> list[dict[str, Any]]:
+    """Score every source of a map as a map of its own; nothing for maps of one source.
+
+    A sign that two sources have counts for both, so the rows don't add up to the total.
+    """
+    rows: list[dict[str, Any]] = []
+    for pair in pairs:
+        sources = sorted(pc.unique(pair.fused["source"]).to_pylist())
+        for source in sources if len(sources) > 1 else ():
+            alone = pair.fused.filter(pc.field("source") == source)
+            score = _score(alone, pair.reference, gate_m=gate_m, match_on=match_on)
+            rows.append(pair.labels | {"source": source} | score_row(score))
+    return rows
 
 
-def _take(values: Any, index: Any) -> Any:
-    return values[np.maximum(index, 0)] if len(values) else np.zeros(len(index))
-
-
-def _pick(column: pa.ChunkedArray, index: Any) -> pa.Array:
-    return pc.take(column, pa.array(index, mask=index < 0)).combine_chunks()
-
-
-def _tile_polygons(tiles: Sequence[str]) -> Any:
-    """Return the polygon of every tile; None for `all`."""
-    import shapely  # noqa: PLC0415
-
-    polygons = np.full(len(tiles), None, dtype=object)
-    real = np.flatnonzero(np.asarray(tiles) != "all")
-    if len(real):
-        bounds = quadkey_bounds([tiles[k] for k in real])
-        polygons[real] = shapely.box(*bounds.T)
-    return polygons
-
-
-def _write_layers(folder: Path, map_: pa.Table, reference: pa.Table, matches: pa.Table, scores: pa.Table) -> None:
-    """Write one GeoJSON file a layer: tiles with their scores, matches, match lines, both maps."""
-    tiles = scores.filter((pc.field("tile") != "all") & (pc.field("concept") == "all"))
-    write_geojson(to_geodataframe(tiles), folder / "scores.geojson")
-    write_geojson(to_geodataframe(matches), folder / "matches.geojson")
-    write_geojson(_match_lines(matches, map_), folder / "match_lines.geojson")
-    write_geojson(to_geodataframe(map_), folder / "fused.geojson")
-    write_geojson(to_geodataframe(reference), folder / "reference.geojson")
-
-
-def _match_lines(matches: pa.Table, map_: pa.Table) -> GeoDataFrame:
-    """Return a line from every matched sign of the map to its reference; lines without length are left out."""
-    import geopandas  # noqa: PLC0415
-    import shapely  # noqa: PLC0415
-
-    labelled = map_.select(["sign_id", BBOX])
-    for name, column in zip(("run_id", "method", "n_vehicles"), _labels(map_).columns, strict=True):
-        labelled = labelled.append_column(name, column)
-    connection = connect()
-    connection.register("matches", matches)
-    connection.register("signs", labelled)
-    lines = run(connection, "evaluate/match_lines", {"min_length_m": _SHORTEST_LINE_M}).to_arrow_table()
-    connection.close()
-    ends = np.stack([lines[name].to_numpy() for name in ("lon", "lat", "ref_lon", "ref_lat")], axis=-1)
-    frame = lines.drop_columns(["lon", "lat", "ref_lon", "ref_lat"]).to_pandas()
-    return geopandas.GeoDataFrame(frame, geometry=shapely.linestrings(ends.reshape(-1, 2, 2)), crs="OGC:CRS84")
+def _write(
+    out: Path, layers: Mapping[str, pa.Table], more: Mapping[str, list[dict[str, Any]]]
+) -> tuple[tuple[Path, ...], int]:
+    """Write everything but the manifest; return the files and the number of signs without an ellipse."""
+    with atomic_path(out) as draft:
+        draft.mkdir()
+        write_table(MATCHES, layers["matches"], draft / "matches.parquet")
+        write_table(SCORES, layers["scores"], draft / "scores.parquet")
+        n_features = write_result_layers(draft, **layers)
+        for name, rows in more.items():
+            if rows:
+                write_csv(rows, draft / f"{name}.csv")
+        names = sorted(path.name for path in draft.iterdir())
+    return tuple(out / name for name in names), n_features["signs_without_ellipse"]

@@ -300,6 +300,7 @@ SCORES = Schema(
     ),
     "Polygon",
     geometry_nullable=True,
+    optional=(_c("cardinality_m2?", FLOAT, "gate_m² / 2 (fp + fn) / tp; with mse_m2 the two parts of gospa_m²"),),
 )
 
 SCHEMAS = MappingProxyType(
