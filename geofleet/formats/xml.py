@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 MAX_DEPTH = 200
 MAX_TOKEN_BYTES = 16 << 20
-_CHUNK_BYTES = 1 << 18
+_CHUNK_BYTES = 1 << 16
 _HEAD_BYTES = 1 << 16
 # Comments and blanks before the declaration are not XML, yet exporters write them. Both patterns are possessive: they
 # take time in proportion to the head, whatever is in it.
