@@ -1,0 +1,223 @@
+"""From the members of a cluster to a sign: position, covariance, class, counts and id.
+
+Members come sorted by cluster and key, and everything is summed in that order, in a frame at the first member: the same
+members give the same bits, whoever holds them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from pyproj import Transformer
+
+from geofleet.algorithms.geodesy import to_ecef
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+COMMON_SIGMA_M = 1.0
+SPREAD_SIGMA_M = 1.0
+POSITION_DIGITS = 9  # degrees: 0.1 mm
+_HASH_DIGITS = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FusedSigns:
+    """One row a cluster.
+
+    Parameters
+    ----------
+    lon_deg, lat_deg
+        (n,) weighted centroid, rounded to 1e-9 degrees.
+    var_e_m2, var_n_m2, cov_en_m2
+        (n,) covariance of the centroid, m²; NaN when a single pass leaves nothing to tell it from.
+    n_passes, n_detections
+        (n,) distinct passes and members.
+    """
+
+    lon_deg: Floats
+    lat_deg: Floats
+    var_e_m2: Floats
+    var_n_m2: Floats
+    cov_en_m2: Floats
+    n_passes: Ints
+    n_detections: Ints
+
+
+def information_weights(n_frames: Floats, spread_m2: Floats) -> Floats:
+    """Return what each detection knows about the position of its sign, 1/m².
+
+    The mean of F frames with spread s is wrong by σ² = τ² + s²/F. The part τ is common to the frames of a pass (GNSS
+    offset, range and bearing calibration), so no number of frames removes it; detections do not declare it, and
+    COMMON_SIGMA_M (1 m, the order of a car's GNSS) stands for it. It keeps a long or a smooth track from outvoting
+    whole passes. Missing values widen the error and never exclude: frames NaN count as one, a spread NaN (or of a
+    single frame) as SPREAD_SIGMA_M².
+
+    Parameters
+    ----------
+    n_frames
+        (n,) frames of the detection, NaN if unknown.
+    spread_m2
+        (n,) variance over frames of one axis (mean of east and north), m², NaN if unknown.
+    """
+    frames = np.fmax(n_frames, 1.0)
+    spread = np.where(np.isfinite(spread_m2) & (spread_m2 >= 0), spread_m2, SPREAD_SIGMA_M**2)
+    return 1.0 / (COMMON_SIGMA_M**2 + spread / frames)
+
+
+def fuse(lon_deg: Floats, lat_deg: Floats, *, weight: Floats, pass_code: Ints, first: Ints) -> FusedSigns:
+    """Estimate the position of every cluster and its covariance.
+
+    The centroid is the weighted mean in the plane that touches the ellipsoid at the first member. Its covariance
+    comes from the scatter *between* passes, as errors within a pass are common: with the share h_p of pass p in the
+    weight and the residual r_p of its mean, S = Σ h_p r_p r_pᵀ / (1 - Σ h_p²) estimates the covariance of one pass
+    without bias and S Σ h_p² that of the centroid; equal shares give the textbook S / P. What all passes share is not
+    in it.
+
+    Parameters
+    ----------
+    lon_deg, lat_deg, weight, pass_code
+        (n,) members, sorted by cluster, pass and track.
+    first
+        (n_clusters + 1,) `first[k]:first[k + 1]` are the members of cluster k; none is empty.
+    """
+    lead = first[:-1]
+    lon0, lat0 = np.radians(lon_deg[lead]), np.radians(lat_deg[lead])
+    zero = np.zeros_like(lon0)
+    origin = to_ecef(lon_deg[lead], lat_deg[lead])
+    axes = np.stack(
+        (
+            np.column_stack((-np.sin(lon0), np.cos(lon0), zero)),
+            np.column_stack((-np.sin(lat0) * np.cos(lon0), -np.sin(lat0) * np.sin(lon0), np.cos(lat0))),
+            np.column_stack((np.cos(lat0) * np.cos(lon0), np.cos(lat0) * np.sin(lon0), np.sin(lat0))),
+        ),
+        axis=1,
+    )
+    offset = to_ecef(lon_deg, lat_deg) - np.repeat(origin, np.diff(first), axis=0)
+    centre, covariance, n_passes = _sum_members(offset, axes, weight, pass_code, first)
+    lon, lat = _on_ground(origin, axes, centre)
+    return FusedSigns(
+        lon_deg=np.round(lon, POSITION_DIGITS),
+        lat_deg=np.round(lat, POSITION_DIGITS),
+        var_e_m2=covariance[:, 0],
+        var_n_m2=covariance[:, 1],
+        cov_en_m2=covariance[:, 2],
+        n_passes=n_passes,
+        n_detections=np.diff(first),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _sum_members(
+    offset: Floats, axes: Floats, weight: Floats, pass_code: Ints, first: Ints
+) -> tuple[Floats, Floats, Ints]:
+    """Return centroids (n, 2), covariances (n, 3: ee, nn, en) and the number of passes of every cluster."""
+    n = first.size - 1
+    centre, covariance, n_passes = np.zeros((n, 2)), np.full((n, 3), np.nan), np.zeros(n, np.int64)
+    sums = np.empty((np.diff(first).max() if n else 0, 3))  # weight, weighted east and north of every pass
+    for k in range(n):
+        p = -1
+        for i in range(first[k], first[k + 1]):
+            if i == first[k] or pass_code[i] != pass_code[i - 1]:
+                p += 1
+                sums[p] = 0.0
+            sums[p, 0] += weight[i]
+            for axis in range(2):
+                sums[p, axis + 1] += weight[i] * (
+                    offset[i, 0] * axes[k, axis, 0] + offset[i, 1] * axes[k, axis, 1] + offset[i, 2] * axes[k, axis, 2]
+                )
+        passes = sums[: p + 1]
+        n_passes[k] = p + 1
+        total = passes[:, 0].sum()
+        centre[k, 0], centre[k, 1] = passes[:, 1].sum() / total, passes[:, 2].sum() / total
+        if p:
+            covariance[k] = _scatter(passes, total, centre[k])
+    return centre, covariance, n_passes
+
+
+@njit(cache=True, nogil=True)
+def _scatter(passes: Floats, total: float, centre: Floats) -> Floats:
+    """Return the covariance (ee, nn, en) of a centroid from the scatter of its passes."""
+    sum_sq_share = 0.0
+    scatter = np.zeros(3)
+    for p in range(passes.shape[0]):
+        share = passes[p, 0] / total
+        east, north = passes[p, 1] / passes[p, 0] - centre[0], passes[p, 2] / passes[p, 0] - centre[1]
+        sum_sq_share += share * share
+        scatter[0] += share * east * east
+        scatter[1] += share * north * north
+        scatter[2] += share * east * north
+    return scatter * (sum_sq_share / (1.0 - sum_sq_share))
+
+
+@cache
+def _from_ecef() -> Transformer:
+    return Transformer.from_pipeline(
+        "+proj=pipeline +step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    )
+
+
+def _on_ground(origin: Floats, axes: Floats, centre: Floats) -> tuple[Floats, Floats]:
+    """Return longitude and latitude of points in tangent planes; the height over the plane is solved for."""
+    local = np.column_stack((centre, np.zeros(len(centre))))
+    lon = lat = np.empty(0)
+    for _ in range(3):
+        lon, lat, height = _from_ecef().transform(*(origin + np.einsum("kj,kjc->kc", local, axes)).T)
+        local[:, 2] -= height
+    return lon, lat
+
+
+def vote(class_code: Ints, confidence: Floats, first: Ints) -> tuple[Ints, Floats]:
+    """Return the class of every cluster and its confidence.
+
+    Every detection has one vote, however many frames it has: what a pass mistakes once it mistakes in every frame. Ties
+    go to the class that comes first. The confidence is the sum of the winners' confidences (1 where missing) over the
+    number of votes.
+    """
+    cluster = np.repeat(np.arange(first.size - 1), np.diff(first))
+    n_classes = int(class_code.max(initial=0)) + 1
+    ballots, place, votes = np.unique(cluster * n_classes + class_code, return_inverse=True, return_counts=True)
+    order = np.lexsort((ballots, -votes, ballots // n_classes))
+    winner = order[np.append(True, np.diff(ballots[order] // n_classes) > 0)] if order.size else order
+    trust = np.bincount(place, np.where(np.isfinite(confidence), confidence, 1.0), minlength=ballots.size)
+    return ballots[winner] % n_classes, trust[winner] / np.diff(first)
+
+
+def name_hashes(hashes: NDArray[np.uint64]) -> list[str]:
+    """Return an id for every hash: "f" and 12 hexadecimal digits.
+
+    Ids that collide (2⁻⁴⁸ a pair) are told apart by a suffix, in the order given.
+    """
+    seen: dict[str, int] = {}
+    names = []
+    for number in hashes.tolist():
+        name = f"f{number:016x}"[: 1 + _HASH_DIGITS]
+        seen[name] = seen.get(name, 0) + 1
+        names.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
+    return names
+
+
+@njit(cache=True, nogil=True)
+def hash_members(pass_hash: NDArray[np.uint64], track_id: Ints, first: Ints) -> NDArray[np.uint64]:
+    """Return a hash of every cluster's members in their order, which names it.
+
+    The keys are chained through the finaliser of SplitMix64 (doi:10.1145/2714064.2660195).
+    """
+    hashes = np.empty(first.size - 1, np.uint64)
+    for k in range(first.size - 1):
+        state = np.uint64(0x9E3779B97F4A7C15)
+        for i in range(first[k], first[k + 1]):
+            for word in (pass_hash[i], np.uint64(track_id[i])):
+                state = (state ^ word) + np.uint64(0x9E3779B97F4A7C15)
+                state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+                state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+                state ^= state >> np.uint64(31)
+        hashes[k] = state
+    return hashes

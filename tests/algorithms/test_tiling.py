@@ -1,0 +1,226 @@
+"""Quadkeys, and clusters that come out the same whatever tiles they were found in."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyproj import Geod
+from sklearn.cluster import DBSCAN
+
+from geofleet.algorithms.fusion import fuse, information_weights, name_hashes, vote
+from geofleet.algorithms.geodesy import EnuFrame
+from geofleet.algorithms.tiling import cluster_tiles, halo_m, join_open, quadkey_bounds, quadkeys
+from geofleet.errors import InputError
+from geofleet.tables.database import connect
+
+EPS_M = 4.0
+
+
+def tile_everything(lon, lat, codes, zoom, min_samples):
+    """Cluster tile by tile with halos found by brute force; return a label a point, -1 for noise."""
+    keys = np.array(quadkeys(lon, lat, zoom))
+    names = sorted(set(keys.tolist()))
+    bounds = quadkey_bounds(names)
+    centres = np.column_stack((bounds[:, [0, 2]].mean(axis=1), bounds[:, [1, 3]].mean(axis=1)))
+    point, tile = [], []
+    for number in range(len(names)):
+        frame = EnuFrame(*centres[number])
+        corners = frame.to_enu(bounds[number, [0, 2, 0, 2]], bounds[number, [1, 1, 3, 3]])
+        margin = halo_m(EPS_M) + 0.5  # a tile's edge bends by less than this in its plane
+        low, high = corners.min(axis=0) - margin, corners.max(axis=0) + margin
+        xy = frame.to_enu(lon, lat)
+        inside = np.flatnonzero(((xy >= low) & (xy <= high)).all(axis=1))
+        point.append(inside)
+        tile.append(np.full(inside.size, number))
+    point, tile = np.concatenate(point), np.concatenate(tile)
+    owned = keys[point] == np.array(names)[tile]
+    found = cluster_tiles(
+        lon[point],
+        lat[point],
+        tile=tile,
+        tile_centres_deg=centres,
+        is_owned=owned,
+        codes=codes[point],
+        eps_m=EPS_M,
+        min_samples=min_samples,
+    )
+    labels = np.full(lon.size, -1)
+    assert np.bincount(point[found.closed_row], minlength=lon.size).max() <= 1
+    labels[point[found.closed_row]] = found.closed_cluster
+    row, cluster = join_open(point[found.open_row], found.open_cluster, found.open_is_core, owned[found.open_row])
+    joined = point[found.open_row][row]
+    assert (labels[joined] == -1).all()  # owned once: by a closed cluster, or by a joined one
+    labels[joined] = cluster + lon.size
+    return labels, found.open_row.size
+
+
+def same_partition(a, b):
+    pairs = set(zip(a.tolist(), b.tolist(), strict=True))
+    return len(pairs) == len(set(a.tolist())) == len(set(b.tolist())) and ((a < 0) == (b < 0)).all()
+
+
+def whole(lon, lat, codes, origin, min_samples):
+    xy = EnuFrame(*origin).to_enu(lon, lat)
+    far = np.column_stack((xy, codes * 1e4))  # classes far apart in a third dimension
+    return DBSCAN(eps=EPS_M, min_samples=min_samples, algorithm="kd_tree").fit_predict(far)
+
+
+ORIGINS = {
+    "a corner of four zoom-12 tiles": (11.42578125, 48.748945343432936),
+    "antimeridian": (180.0, 61.0),
+    "70 degrees north": (25.751953125, 70.0),
+    "equator and prime meridian": (0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("name", ORIGINS)
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 10_000), zoom=st.integers(12, 20), min_samples=st.integers(2, 6))
+def test_tiles_do_not_show(name, seed, zoom, min_samples):
+    origin, rng = ORIGINS[name], np.random.default_rng(seed)
+    centres = rng.uniform(-60, 60, (50, 2))
+    xy = np.repeat(centres, 8, axis=0) + rng.normal(0, 2.0, (400, 2))
+    lon, lat = EnuFrame(*origin).to_lonlat(xy)
+    codes = rng.integers(0, 2, 400)
+    labels, _ = tile_everything(lon, lat, codes, zoom, min_samples)
+    assert same_partition(labels, whole(lon, lat, codes, origin, min_samples))
+
+
+def test_a_cluster_longer_than_many_tiles_stays_one():
+    # a chain of 1500 m over tiles of zoom 20 (19 m here): no halo could hold it
+    xy = np.column_stack((np.arange(-750, 750, 1.5), np.zeros(1000)))
+    lon, lat = EnuFrame(24.94, 60.17).to_lonlat(xy)
+    labels, n_open = tile_everything(lon, lat, np.zeros(1000, int), 20, 3)
+    assert n_open > 1000
+    assert len(set(labels.tolist())) == 1
+    assert labels[0] >= 0
+
+
+def test_nothing_open_joins_to_nothing():
+    nothing = np.empty(0, np.int64)
+    assert [a.size for a in join_open(nothing, nothing, nothing.astype(bool), nothing.astype(bool))] == [0, 0]
+
+
+def test_a_border_point_goes_to_the_cluster_whose_first_core_comes_first():
+    # point 5 is reached by clusters 0 (cores 7, 8) and 1 (cores 3, 4); 4 shows that cluster 2 is part of cluster 1
+    point = np.array([7, 8, 5, 3, 4, 5, 4, 1])
+    cluster = np.array([0, 0, 0, 1, 1, 1, 2, 2])
+    core = np.array([True, True, False, True, True, False, True, False])
+    owned = np.array([True, True, True, True, True, True, False, True])
+    row, joined = join_open(point, cluster, core, owned)
+    of = dict(zip(point[row].tolist(), joined.tolist(), strict=True))
+    assert sorted(of) == [1, 3, 4, 5, 7, 8]
+    assert of[5] == of[3] == of[4] == of[1] != of[7] == of[8]
+
+
+@pytest.mark.parametrize("zoom", [1, 12, 16, 20, 23])
+def test_quadkeys_equal_those_of_duckdb(zoom):
+    rng = np.random.default_rng(zoom)
+    lon = np.append(rng.uniform(-180, 180, 500), [180.0, -180.0, 0.0, 11.42578125])
+    lat = np.append(rng.uniform(-85.05, 85.05, 500), [0.0, 0.0, 85.05, -85.05])
+    connection = connect()
+    rows = [
+        connection.execute("SELECT ST_QuadKey(?, ?, ?)", [*p, zoom]).fetchone()[0] for p in zip(lon, lat, strict=True)
+    ]
+    connection.close()
+    assert quadkeys(lon, lat, zoom) == rows
+
+
+def test_bounds_hold_their_points_half_open():
+    rng = np.random.default_rng(2)
+    lon, lat = rng.uniform(-180, 180, 200), rng.uniform(-85, 85, 200)
+    west, south, east, north = quadkey_bounds(quadkeys(lon, lat, 17)).T
+    assert ((west <= lon) & (lon < east) & (south <= lat) & (lat <= north)).all()
+    assert quadkey_bounds(["0"]).tolist() == [[-180.0, 0.0, 0.0, pytest.approx(85.0511287798)]]
+    assert quadkeys([], [], 16) == []
+    assert quadkey_bounds([]).shape == (0, 4)
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "zoom"), [(math.nan, 0, 16), (0, 85.06, 16), (181, 0, 16), (0, 0, 0), (0, 0, 24)]
+)
+def test_positions_outside_web_mercator_are_refused(lon, lat, zoom):
+    with pytest.raises(InputError):
+        quadkeys([lon], [lat], zoom)
+
+
+def test_a_text_that_is_no_quadkey_is_refused():
+    with pytest.raises(InputError, match="'12x' is not a quadkey"):
+        quadkey_bounds(["12x"])
+
+
+def test_centroid_is_the_weighted_mean_on_the_ground():
+    # three quarters of the way along 8 m of geodesic, at 70° N beside the antimeridian
+    geod = Geod(ellps="WGS84")
+    lon1, lat1, _ = geod.fwd(179.99999, 70.0, 60.0, 8.0)
+    fused = fuse(
+        np.array([179.99999, lon1]),
+        np.array([70.0, lat1]),
+        weight=np.array([1.0, 3.0]),
+        pass_code=np.array([0, 1]),
+        first=np.array([0, 2]),
+    )
+    azimuth, _, distance = geod.inv(179.99999, 70.0, fused.lon_deg[0], fused.lat_deg[0])
+    assert distance == pytest.approx(6.0, abs=2e-4)
+    assert azimuth == pytest.approx(60.0, abs=2e-3)
+
+
+def test_covariance_is_that_of_the_mean_of_passes():
+    # four passes with one detection each at (±2, 0), (0, ±1) and equal weights: S/P with P - 1 in S
+    lon, lat = EnuFrame(10.0, 50.0).to_lonlat(np.array([[2.0, 0], [-2, 0], [0, 1], [0, -1]]))
+    ones = np.ones(4)
+    fused = fuse(lon, lat, weight=ones, pass_code=np.arange(4), first=np.array([0, 4]))
+    assert fused.var_e_m2[0] == pytest.approx(8 / 3 / 4, rel=1e-5)
+    assert fused.var_n_m2[0] == pytest.approx(2 / 3 / 4, rel=1e-5)
+    assert fused.cov_en_m2[0] == pytest.approx(0.0, abs=1e-5)
+    # ten copies within the passes add nothing: errors of a pass are common
+    again = fuse(
+        np.repeat(lon, 10),
+        np.repeat(lat, 10),
+        weight=np.ones(40),
+        pass_code=np.repeat(np.arange(4), 10),
+        first=np.array([0, 40]),
+    )
+    assert again.var_e_m2[0] == pytest.approx(fused.var_e_m2[0])
+    assert (again.n_passes[0], again.n_detections[0]) == (4, 40)
+    single = fuse(lon, lat, weight=ones, pass_code=np.zeros(4, int), first=np.array([0, 4]))
+    assert np.isnan(single.var_e_m2[0])
+
+
+def test_covariance_is_unbiased_for_unequal_weights():
+    rng = np.random.default_rng(4)
+    n_clusters, weight = 4000, np.array([1.0, 2.0, 5.0])
+    xy = rng.normal(0, 1.0, (3 * n_clusters, 2))
+    lon, lat = EnuFrame(10.0, 0.0).to_lonlat(xy)
+    fused = fuse(
+        lon,
+        lat,
+        weight=np.tile(weight, n_clusters),
+        pass_code=np.tile(np.arange(3), n_clusters),
+        first=np.arange(0, 3 * n_clusters + 1, 3),
+    )
+    truth = (weight**2).sum() / weight.sum() ** 2
+    assert fused.var_e_m2.mean() == pytest.approx(truth, rel=0.06)
+    assert fused.var_n_m2.mean() == pytest.approx(truth, rel=0.06)
+    assert np.var((fused.lon_deg - 10) * 111319.49) == pytest.approx(truth, rel=0.06)
+
+
+def test_weights_work_on_whatever_is_there():
+    nan = math.nan
+    weights = information_weights(np.array([nan, 1, 10, 10, 1000, 10]), np.array([nan, nan, 1.0, 4.0, 1.0, nan]))
+    assert weights.tolist() == pytest.approx([0.5, 0.5, 1 / 1.1, 1 / 1.4, 1 / 1.001, 1 / 1.1])
+
+
+def test_votes_and_ties():
+    code, confidence = vote(np.array([2, 1, 2, 3, 1]), np.array([0.5, 1.0, math.nan, 1.0, 0.8]), np.array([0, 3, 5]))
+    assert code.tolist() == [2, 1]
+    assert confidence.tolist() == [0.5, 0.4]
+
+
+def test_colliding_ids_are_told_apart():
+    hashes = np.array([0xABCDEF0123450000, 0x1, 0xABCDEF012345FFFF], np.uint64)
+    assert name_hashes(hashes) == ["fabcdef012345", "f000000000000", "fabcdef012345-2"]
