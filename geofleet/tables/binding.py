@@ -1,0 +1,74 @@
+"""A stored table as a view in DuckDB, read as it is queried and checked against its schema beforehand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import duckdb
+
+from geofleet.errors import InputError, TableError
+from geofleet.tables.schemas import GEOMETRY
+
+if TYPE_CHECKING:
+    from geofleet.tables.schemas import Schema
+
+_NUMBERS = ("INT", "DOUBLE", "FLOAT", "DECIMAL", "HUGEINT")
+
+
+def bind_table(connection: duckdb.DuckDBPyConnection, schema: Schema, path: Path) -> None:
+    """Make a view named after the schema of a Parquet file, or of a hive-partitioned folder of them.
+
+    Partition values stay text: DuckDB's own hive reader would take vehicle `007` for the number 7.
+
+    Raises
+    ------
+    InputError
+        The file does not exist or is not Parquet.
+    TableError
+        A column is missing, or has a type that cannot stand for the one of the schema.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError("there is no such file.", where=str(path), todo="Check the path.")
+    files = sorted(str(file) for file in path.rglob("*.parquet")) if path.is_dir() else [str(path)]
+    if not files:
+        raise InputError("the folder holds no Parquet file.", where=str(path), todo="Check the path.")
+    try:
+        view = connection.read_parquet(files, filename=True)
+    except duckdb.Error as error:
+        raise InputError(
+            f"not a Parquet file ({str(error).splitlines()[0]}).",
+            where=str(path),
+            todo=f"A {schema.name} table is expected; `geofleet ingest` makes one from other formats.",
+        ) from None
+    absent = [name for name in schema.partitions if name not in view.columns] if path.is_dir() else []
+    values = [f"url_decode(regexp_extract(filename, '/{name}=([^/]*)/', 1)) AS {name}" for name in absent]
+    view = view.project(", ".join(["* EXCLUDE (filename)", *values]))
+    _check(connection, schema, view, path)
+    view.create_view(schema.name, replace=True)
+
+
+def _check(connection: duckdb.DuckDBPyConnection, schema: Schema, view: duckdb.DuckDBPyRelation, path: Path) -> None:
+    where = f"{path}: table {schema.name}"
+    todo = f"`geofleet schema {schema.name}` prints what it must hold."
+    found = {name: str(kind) for name, kind in zip(view.columns, view.types, strict=True)}
+    wanted = connection.from_arrow(schema.arrow(()).empty_table())
+    for name, kind in zip(wanted.columns, map(str, wanted.types), strict=True):
+        if name == GEOMETRY:
+            continue  # spatial reads it as GEOMETRY, not as the bytes it is stored in
+        if name not in found:
+            raise TableError(f"missing column {name}.", where=where, todo=todo)
+        if not _can_stand_for(found[name], kind):
+            raise TableError(f"column {name} is {found[name]}, not {kind}.", where=where, todo=todo)
+
+
+def _can_stand_for(found: str, wanted: str) -> bool:
+    """Return whether a column of one type may be read as another: any number is a number, a null column is anything."""
+    if wanted == "BIGINT":
+        return "INT" in found and "HUGE" not in found
+    if wanted == "DOUBLE":
+        return any(number in found for number in _NUMBERS) and "(" not in found.replace("DECIMAL(", "")
+    if wanted.startswith("TIMESTAMP"):
+        return found.startswith("TIMESTAMP")
+    return found == wanted

@@ -1,0 +1,25 @@
+-- why: the usable detections that share their key with another; copy 1, the first by its values, is the one kept
+-- reads: @aggregate/judged
+-- params: none
+-- writes: reason VARCHAR, run_id VARCHAR, vehicle_id VARCHAR, pass_id VARCHAR, track_id BIGINT, sign_class VARCHAR,
+--         lon DOUBLE, lat DOUBLE, n_frames BIGINT, spread_m2 DOUBLE, class_confidence DOUBLE, t_first_us BIGINT,
+--         t_last_us BIGINT, copy BIGINT
+WITH repeated AS (
+    SELECT
+        run_id,
+        pass_id,
+        track_id
+    FROM judged
+    WHERE reason IS NULL
+    GROUP BY run_id, pass_id, track_id
+    HAVING count(*) > 1
+)
+SELECT
+    judged.*,
+    row_number() OVER (
+        PARTITION BY run_id, pass_id, track_id
+        ORDER BY lon, lat, sign_class, vehicle_id, n_frames, spread_m2, class_confidence, t_first_us, t_last_us
+    ) AS copy
+FROM judged
+SEMI JOIN repeated USING (run_id, pass_id, track_id)
+WHERE reason IS NULL

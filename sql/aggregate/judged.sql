@@ -1,0 +1,28 @@
+-- why: every detection with the reason why it cannot be used, or none: it must be placed, classed and named; ST_QuadKey
+--      takes NaN and latitudes beyond Web Mercator without a word
+-- reads: detections
+-- params: none
+-- writes: reason VARCHAR, run_id VARCHAR, vehicle_id VARCHAR, pass_id VARCHAR, track_id BIGINT, sign_class VARCHAR,
+--         lon DOUBLE, lat DOUBLE, n_frames BIGINT, spread_m2 DOUBLE, class_confidence DOUBLE, t_first_us BIGINT,
+--         t_last_us BIGINT
+SELECT
+    CASE
+        WHEN run_id IS NULL OR vehicle_id IS NULL OR pass_id IS NULL OR track_id IS NULL THEN 'key missing'
+        WHEN coalesce(trim(sign_class), '') = '' THEN 'class missing'
+        WHEN bbox.xmin IS NULL OR bbox.ymin IS NULL THEN 'position missing'
+        WHEN NOT (isfinite(bbox.xmin) AND isfinite(bbox.ymin)) THEN 'position not finite'
+        WHEN abs(bbox.xmin) > 180 OR abs(bbox.ymin) > 85.05 THEN 'position out of range'
+    END AS reason,
+    run_id,
+    vehicle_id,
+    pass_id,
+    track_id,
+    sign_class,
+    bbox.xmin AS lon,
+    bbox.ymin AS lat,
+    n_frames,
+    (sigma_e_m * sigma_e_m + sigma_n_m * sigma_n_m) / 2 AS spread_m2, -- mean variance of an axis
+    class_confidence,
+    epoch_us(t_first) AS t_first_us,
+    epoch_us(t_last) AS t_last_us
+FROM detections
