@@ -99,7 +99,7 @@ def test_no_signs_near_the_drive(tables, tmp_path):
     result = geofleet(
         "simulate", "--signs", tables / "signs.parquet", "--drive", "far.parquet", "--out", "out", cwd=tmp_path
     )
-    assert_refused(result, "15", "far.parquet", "km", cwd=tmp_path)
+    assert_refused(result, "no sign is within 15 m of the drive 'far'", "m away", "corridor_m", cwd=tmp_path)
 
 
 @pytest.mark.parametrize("key", ["rang_m=3", "sensor.colour=1", "fov_deg=400", "gnss_sigma_m=-1", "nothing"])

@@ -31,6 +31,8 @@ _MARKS: dict[str, dict[str, Any]] = {
     "FN": {"marker": "D", "facecolors": "none", "edgecolors": "#CC0000", "s": 70, "label": "missed (FN)", "zorder": 6},
 }
 _MARGIN_M = 60.0
+# No random ids in the SVG: the same run gives the same bytes.
+_STYLE: dict[Any, Any] = {"svg.hashsalt": "geofleet", "font.size": 9, "savefig.bbox": "tight"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,8 @@ def report(run_dir: Path, out: Path) -> ReportResult:
     InputError
         A table of the run is missing.
     """
+    import matplotlib as mpl  # noqa: PLC0415  (a second of import that only this function needs)
+
     paths = {
         "lanes": run_dir / "lanes" / "lanes.parquet",
         "drives": run_dir / "drives" / "drives.parquet",
@@ -58,11 +62,10 @@ def report(run_dir: Path, out: Path) -> ReportResult:
     lanes, drives = read_table(LANES, paths["lanes"]), read_table(DRIVES, paths["drives"])
     matches, scores = read_table(MATCHES, paths["matches"]), read_table(SCORES, paths["scores"])
     total = scores.filter((pc.field("tile") == "all") & (pc.field("concept") == "all")).slice(0, 1).to_pylist()[0]
-    figure = _draw_map(lanes, drives, _of_run(matches, total), total)
-    with atomic_path(out) as draft:
+    with mpl.rc_context(_STYLE), atomic_path(out) as draft:
+        figure = _draw_map(lanes, drives, _of_run(matches, total), total)
         draft.mkdir()
         for suffix in ("png", "svg"):
-            # Dates and random ids out: the same run gives the same bytes.
             figure.savefig(draft / f"map.{suffix}", dpi=160, metadata={"Date": None} if suffix == "svg" else {})
     write_manifest(out, step="report", inputs=paths.values())
     return ReportResult(out, (out / "map.png", out / "map.svg"))
@@ -78,26 +81,22 @@ def _of_run(matches: pa.Table, total: dict[str, Any]) -> pa.Table:
 
 def _draw_map(lanes: pa.Table, drives: pa.Table, matches: pa.Table, total: dict[str, Any]) -> Figure:
     """Draw in the ENU frame of the drive, so that both axes are metres."""
-    import matplotlib as mpl  # noqa: PLC0415  (a second of import that only this function needs)
     from matplotlib.collections import LineCollection  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     lon, lat = lonlat(drives)
     frame = EnuFrame.around(lon, lat)
     path = frame.to_enu(lon, lat)
-    with mpl.rc_context({"svg.hashsalt": "geofleet", "font.size": 9, "savefig.bbox": "tight"}):
-        figure = Figure(figsize=(9, 6.5), layout="constrained")
-        axes = figure.add_subplot()
-        axes.add_collection(LineCollection(_lines(lanes, frame), colors="#C9C9C9", linewidths=2.0, zorder=1))
-        axes.plot(*path.T, color="#0072B2", linewidth=1.6, label="drive (derived)", zorder=2)
-        _draw_outcomes(axes, matches, frame)
-        low, high = path.min(axis=0) - _MARGIN_M, path.max(axis=0) + _MARGIN_M
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="east (m)", ylabel="north (m)", aspect="equal")
-        axes.set_title(_title(total), loc="left", fontsize=10)
-        axes.legend(loc="best", framealpha=0.95)
-        figure.text(
-            0.99, 0.005, "Map data © OpenStreetMap contributors (ODbL)", ha="right", fontsize=7, color="#555555"
-        )
+    figure = Figure(figsize=(9, 6.5), layout="constrained")
+    axes = figure.add_subplot()
+    axes.add_collection(LineCollection(_lines(lanes, frame), colors="#C9C9C9", linewidths=2.0, zorder=1))
+    axes.plot(*path.T, color="#0072B2", linewidth=1.6, label="drive (derived)", zorder=2)
+    _draw_outcomes(axes, matches, frame)
+    low, high = path.min(axis=0) - _MARGIN_M, path.max(axis=0) + _MARGIN_M
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="east (m)", ylabel="north (m)", aspect="equal")
+    axes.set_title(_title(total), loc="left", fontsize=10)
+    axes.legend(loc="best", framealpha=0.95)
+    figure.text(0.99, 0.005, "Map data © OpenStreetMap contributors (ODbL)", ha="right", fontsize=7, color="#555555")
     return figure
 
 

@@ -242,11 +242,23 @@ def _column(schema: Schema, field: pa.Field, value: Any, n_rows: int) -> pa.Arra
 
 
 def _cast(array: pa.Array | pa.ChunkedArray, field: pa.Field) -> pa.Array | pa.ChunkedArray:
-    """Cast to the type of a field; text never turns into numbers or times by itself."""
-    textual = pa.types.is_string(array.type) or pa.types.is_large_string(array.type)
-    if textual and not pa.types.is_string(field.type):
+    """Cast to the type of a field within its family: numbers never turn into text, nor text into numbers or times."""
+    values = array.type.value_type if pa.types.is_dictionary(array.type) else array.type
+    if not (pa.types.is_null(values) or _family(values) == _family(field.type)):
         raise pa.ArrowTypeError(f"found {array.type}")
     return array.cast(field.type)
+
+
+def _family(kind: pa.DataType) -> str:
+    """Return what types may be cast into each other without a change of meaning."""
+    families = {
+        "text": pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind),
+        "number": pa.types.is_integer(kind) or pa.types.is_floating(kind),
+        "time": pa.types.is_timestamp(kind),
+        "list": pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind),
+        "bytes": pa.types.is_binary(kind) or pa.types.is_large_binary(kind),
+    }
+    return next((name for name, is_it in families.items() if is_it), str(kind))
 
 
 def _encode(schema: Schema, geometry: Any, n_rows: int) -> list[pa.Array]:
