@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from geofleet.config import Config
+    from geofleet.steps.evaluate import EvaluateResult
 
 app = typer.Typer(
     name="geofleet",
@@ -189,6 +190,9 @@ def evaluate(
     out: OutFolder,
     gate: Annotated[float | None, typer.Option("--gate", help="c: a match is nearer than this, metres.")] = None,
     match_on: Annotated[str | None, typer.Option(help="class, concept or none.")] = None,
+    clip: Annotated[bool, typer.Option("--clip", help="Score only where both maps have signs.")] = False,
+    clip_m: Annotated[float | None, typer.Option(help="With --clip: as near as this, 100 m if not given.")] = None,
+    in_view: Annotated[bool, typer.Option("--in-view", help="Score only signs that a pass had in view.")] = False,
     require: Annotated[list[str] | None, typer.Option(help='Exit 1 when missed: "gospa_m<0.8".')] = None,
     config: ConfigFile = None,
     scenario: Scenario = "paper",
@@ -203,13 +207,13 @@ def evaluate(
 
     settled = _settle(config or scenario, settings, gate_m=gate, match_on=match_on)
     requirements = step.parse_requirements(require or [])
-    result = step.evaluate(map_, reference, out, config=settled)
+    reach_m = step.CLIP_M if clip and clip_m is None else clip_m
+    result = step.evaluate(map_, reference, out, config=settled, clip_m=reach_m, in_view=in_view)
     missed = step.missed_requirements(result.totals, requirements)
     if as_json:
         _print_json({**asdict(result), "missed": missed})
     else:
-        _print_scores(result.totals)
-        _print_files(result.files)
+        _print_evaluation(result)
     for sentence in missed:
         sys.stderr.write(f"geofleet: {sentence}\n")
     if missed:
@@ -370,6 +374,20 @@ def _print_scores(totals: tuple[dict[str, Any], ...]) -> None:
     for total in totals:
         if total["null_reason"]:
             typer.echo(f"{total['run_id'] or total['method']}: {total['null_reason']}")
+
+
+def _print_evaluation(result: EvaluateResult) -> None:
+    """Print totals, their means when there are several runs, sources when there are several, and what was left out."""
+    _print_scores(result.totals)
+    for rows, is_told in ((result.summary, len(result.totals) > 1), (result.sources, bool(result.sources))):
+        if is_told:
+            names = tuple(name for name in rows[0] if name not in ("run_id", "match_on", "gate_m", "null_reason"))
+            typer.echo()
+            _print_table(names, [tuple(row[name] for name in names) for row in rows])
+    for name, number in result.counts.items():
+        if number:
+            typer.echo(f"{name}: {number}")
+    _print_files(result.files)
 
 
 def _print_files(files: tuple[Path, ...]) -> None:
