@@ -1,0 +1,347 @@
+"""Rows and geometry of a vector or table file: GDAL's formats through pyogrio, Parquet and CSV through Arrow.
+
+The format is told from the content, and GDAL is asked for that one driver: no file can make it open another file.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import json
+import re
+import warnings
+import zipfile
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import shapely
+
+from geofleet.errors import ConfigError, InputError
+from geofleet.formats.reading import read_head
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+CRS84 = "OGC:CRS84"
+_ZIP, _SQLITE, _SHP, _FGB, _PARQUET = b"PK\x03\x04", b"SQLite format 3\0", b"\x00\x00\x27\x0a", b"fgb\x03", b"PAR1"
+_MARKS = {_SQLITE: "gpkg", _SHP: "shapefile", _FGB: "flatgeobuf", _PARQUET: "parquet", _ZIP: "shapefile.zip"}
+_SEQUENCE = re.compile(rb'(?:\x1e|\s*\{[^\n]*"Feature"[^\n]*\}\s*\n\s*\{)')
+_CRS_NAME = re.compile(
+    rb'"crs"\s*:\s*\{\s*(?:"type"\s*:\s*"([a-z]+)"\s*,\s*)?"properties"\s*:\s*\{\s*"\w+"\s*:\s*"([^"]*)"'
+)
+_MAX_UNPACKED_BYTES = 4 << 30
+_CSV_BLOCK_BYTES = 16 << 20
+_DELIMITERS = ";\t|,"
+_TODO = "Fetch or export it again."
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """The rows of a file.
+
+    Parameters
+    ----------
+    table
+        Attributes, without the geometry.
+    geometry
+        Geometries, None where there is none, shape (n,); None for a file of plain rows.
+    crs
+        As pyproj takes it; None when the file does not say.
+    file_format
+        Short name.
+    skipped, found
+        What was left out and why; what else is worth telling.
+    """
+
+    table: pa.Table
+    geometry: NDArray[np.object_] | None
+    crs: Any
+    file_format: str
+    skipped: dict[str, int] = field(default_factory=dict)
+    found: dict[str, int] = field(default_factory=dict)
+
+
+def detect(head: bytes) -> str:
+    """Return the short name of the format that a file's first bytes show; text that is no JSON is taken for CSV.
+
+    "" for anything else.
+    """
+    for mark, name in _MARKS.items():
+        if head.startswith(mark):
+            return name
+    text = head.removeprefix(codecs.BOM_UTF8).lstrip()
+    if _SEQUENCE.match(text):
+        return "geojsonseq"
+    if text.startswith((b"{", b"[")):
+        return "geojson"
+    is_utf16 = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if text.startswith(b"<") or (b"\0" in head and not is_utf16):
+        return ""
+    return "csv" if text else ""
+
+
+def read_features(
+    path: Path, *, layer: str | None = None, encoding: str | None = None, delimiter: str | None = None
+) -> Features:
+    """Read all rows of a file.
+
+    Parameters
+    ----------
+    path
+        GeoJSON, GeoJSON text sequence, GeoPackage, Shapefile or a zip of one, FlatGeobuf, (Geo)Parquet or CSV.
+    layer
+        Layer of a GeoPackage or zip; by default the only one with geometry.
+    encoding, delimiter
+        Of a CSV file; by default UTF-8, else Windows-1252, and what its header shows.
+
+    Raises
+    ------
+    InputError
+        The file is missing, empty, damaged or of another format.
+    """
+    found = detect(read_head(path))
+    try:
+        if found == "csv":
+            return _read_csv(path, encoding, delimiter)
+        if found == "parquet":
+            return _read_parquet(path)
+        if found:
+            return _read_gdal(path, found, layer)
+    except (
+        pa.ArrowException,
+        OSError,
+        ValueError,
+        KeyError,
+        OverflowError,
+        MemoryError,
+        shapely.GEOSException,
+    ) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"damaged or not {found} ({reason[:300]}).", where=str(path), todo=_TODO) from None
+    raise InputError(
+        "no format of an inventory.",
+        where=str(path),
+        todo="Give GeoJSON, GeoPackage, Shapefile, FlatGeobuf, GeoParquet or CSV.",
+    )
+
+
+def _read_gdal(path: Path, found: str, layer: str | None) -> Features:
+    import pyogrio  # noqa: PLC0415  (loads GDAL, which only these formats need)
+    from pyogrio.errors import CRSError, DataLayerError, DataSourceError, FieldError, GeometryError  # noqa: PLC0415
+
+    source, skipped = _gdal_source(path, found)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        try:
+            layer, n_others = _layer(source, path, layer)
+            meta, table = pyogrio.read_arrow(source, layer=layer, **_open_options(found))
+        except (DataSourceError, DataLayerError, CRSError, FieldError, GeometryError, RuntimeError) as error:
+            raise InputError(f"damaged or not {found} ({str(error)[:300]}).", where=str(path), todo=_TODO) from None
+    name = meta["geometry_name"] or "wkb_geometry"
+    notes = {f"GDAL warned: {str(warning.message)[:200]}": 1 for warning in told}
+    if n_others:
+        notes["layers not read"] = n_others
+    if name not in table.column_names:
+        return Features(table, None, None, found, skipped, notes)
+    crs = meta["crs"]
+    if found in {"geojson", "geojsonseq"}:
+        crs = _geojson_crs(path) or CRS84
+    geometry = shapely.from_wkb(table[name].to_numpy(zero_copy_only=False), on_invalid="ignore")
+    return Features(table.drop_columns([name]), np.asarray(geometry, object), crs, found, skipped, notes)
+
+
+def _gdal_source(path: Path, found: str) -> tuple[str, dict[str, int]]:
+    """Return the path as GDAL wants it, with the driver where it can be named."""
+    absolute = str(path.resolve())
+    if found == "shapefile.zip":
+        return _zipped_shapefile(path), {}
+    prefix = {"geojson": "GeoJSON:", "geojsonseq": "GeoJSONSeq:"}.get(found, "")
+    return prefix + absolute, {}
+
+
+def _zipped_shapefile(path: Path) -> str:
+    """Return the one Shapefile in a zip, refusing one that unpacks to more than `_MAX_UNPACKED_BYTES`."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+    except (zipfile.BadZipFile, NotImplementedError) as error:
+        raise InputError(f"damaged zip file ({error}).", where=str(path), todo=_TODO) from None
+    if sum(entry.file_size for entry in entries) > _MAX_UNPACKED_BYTES:
+        raise InputError(
+            f"the zip file unpacks to more than {_MAX_UNPACKED_BYTES >> 30} GiB.", where=str(path), todo="Unpack it."
+        )
+    names = [e.filename for e in entries if e.filename.lower().endswith(".shp") and "__MACOSX" not in e.filename]
+    if len(names) != 1:
+        raise InputError(
+            f"the zip file holds {len(names)} Shapefiles, not one.",
+            where=str(path),
+            todo="Unpack it and give the file.",
+        )
+    return f"/vsizip/{{{path.resolve()}}}/{names[0]}"
+
+
+def _open_options(found: str) -> dict[str, Any]:
+    # Dates stay text: GDAL reads 1/2/2022 by its own rules, which the user cannot override
+    return {"DATE_AS_STRING": "YES"} if found == "geojson" else {}
+
+
+def _layer(source: str, path: Path, layer: str | None) -> tuple[str, int]:
+    """Return the layer to read and how many others there are."""
+    import pyogrio  # noqa: PLC0415  (as above)
+
+    layers = [(str(name), kind) for name, kind in pyogrio.list_layers(source)]
+    names = [name for name, _ in layers]
+    if layer is not None:
+        if layer not in names:
+            raise ConfigError(f"there is no layer {layer!r}.", where=str(path), todo=f"Layers are {', '.join(names)}.")
+        return layer, len(names) - 1
+    spatial = [name for name, kind in layers if kind]
+    if len(spatial) > 1:
+        raise InputError(
+            f"the file has {len(spatial)} layers: {', '.join(spatial)[:300]}.",
+            where=str(path),
+            todo="Name one: layer=.",
+        )
+    if not names:
+        raise InputError("the file has no layer.", where=str(path), todo=_TODO)
+    return (spatial or names)[0], len(names) - 1
+
+
+def _geojson_crs(path: Path) -> str:
+    """Return the CRS that a GeoJSON file names, "" without one; GDAL takes a name it does not know for degrees."""
+    from pyproj import CRS  # noqa: PLC0415  (takes a moment to load)
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
+    match = _CRS_NAME.search(read_head(path)) or _CRS_NAME.search(_tail(path))
+    if not match:
+        return ""
+    kind, name = (match[1] or b"name").decode(), match[2].decode("utf-8", "replace")
+    if name.upper().rstrip("/") in {"", "URN:OGC:DEF:CRS:OGC:1.3:CRS84"}:
+        return ""
+    try:
+        if kind == "name":
+            return str(CRS.from_user_input(name).to_wkt())
+    except CRSError:
+        pass
+    raise InputError(f"the file names a CRS that cannot be used: {name[:80]!r}.", where=str(path), todo="Give --crs.")
+
+
+def _tail(path: Path) -> bytes:
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - 4096, 0))
+        return file.read()
+
+
+def _read_parquet(path: Path) -> Features:
+    import pyarrow.parquet as pq  # noqa: PLC0415  (only Parquet needs it)
+
+    table = pq.ParquetFile(path).read()
+    raw = (table.schema.metadata or {}).get(b"geo")
+    plain = table.replace_schema_metadata(None)
+    if raw is None:
+        return _with_wkb(Features(plain, None, None, "parquet"))
+    geo = json.loads(raw)
+    name = geo["primary_column"]
+    about = geo["columns"][name]
+    if about["encoding"] == "WKB":
+        geometry = shapely.from_wkb(plain[name].to_numpy(zero_copy_only=False), on_invalid="ignore")
+    else:
+        import geopandas  # noqa: PLC0415  (only the rare native encodings need it)
+
+        geometry = np.asarray(geopandas.read_parquet(path, columns=[name]).geometry.array)
+    crs = about.get("crs", CRS84)  # absent means CRS84, null means unknown
+    others = [
+        column for column, kind in geo["columns"].items() if column != name and column in plain.column_names and kind
+    ]
+    covering = [side[0] for side in about.get("covering", {}).get("bbox", {}).values()]
+    dropped = [column for column in dict.fromkeys([name, *others, *covering]) if column in plain.column_names]
+    return Features(plain.drop_columns(dropped), np.asarray(geometry, object), _parquet_crs(crs, path), "geoparquet")
+
+
+def _parquet_crs(crs: Any, path: Path) -> Any:
+    from pyproj import CRS  # noqa: PLC0415  (takes a moment to load)
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
+    try:
+        return CRS.from_json_dict(crs).to_wkt() if isinstance(crs, dict) else crs
+    except CRSError as error:
+        raise InputError(
+            f"the CRS of the file cannot be used ({error}).", where=str(path), todo="Give --crs."
+        ) from None
+
+
+def _with_wkb(features: Features) -> Features:
+    """Take a column of WKB for the geometry of a Parquet file that does not describe it."""
+    for name in ("geometry", "geom", "wkb_geometry"):
+        if name in features.table.column_names and pa.types.is_binary(features.table.schema.field(name).type):
+            wkb = features.table[name].to_numpy(zero_copy_only=False)
+            geometry = np.asarray(shapely.from_wkb(wkb, on_invalid="ignore"), object)
+            return replace(features, table=features.table.drop_columns([name]), geometry=geometry)
+    return features
+
+
+def _read_csv(path: Path, encoding: str | None, delimiter: str | None) -> Features:
+    from pyarrow import csv as arrow_csv  # noqa: PLC0415  (only CSV needs it)
+
+    encoding, notes = (encoding, {}) if encoding else _encoding(path)
+    names, delimiter = _header(path, encoding, delimiter)
+    bad: list[int] = []
+
+    def count(row: Any) -> str:
+        bad.append(row.actual_columns)
+        return "skip"
+
+    table = arrow_csv.read_csv(
+        path,
+        read_options=arrow_csv.ReadOptions(encoding=encoding, block_size=_CSV_BLOCK_BYTES, use_threads=False),
+        parse_options=arrow_csv.ParseOptions(delimiter=delimiter, newlines_in_values=True, invalid_row_handler=count),
+        # Text, all of it: as numbers 274.10 and 0205 would lose what tells them apart
+        convert_options=arrow_csv.ConvertOptions(column_types=dict.fromkeys(names, pa.string())),
+    )
+    skipped = {"rows with another number of columns than the header": len(bad)} if bad else {}
+    return Features(table, None, None, "csv", skipped, notes)
+
+
+def _encoding(path: Path) -> tuple[str, dict[str, int]]:
+    """Return the encoding of a text: by its byte order mark, else UTF-8 when all of it is, else Windows-1252."""
+    if read_head(path).startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16", {}
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    try:
+        for chunk in _chunks(path):
+            decoder.decode(chunk)
+        decoder.decode(b"", final=True)
+    except UnicodeDecodeError:
+        return "cp1252", {"read as Windows-1252, since it is not UTF-8": 1}
+    return "utf-8", {}
+
+
+def _chunks(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while chunk := file.read(1 << 20):
+            yield chunk
+
+
+def _header(path: Path, encoding: str, delimiter: str | None) -> tuple[list[str], str]:
+    """Return the column names and what stands between them."""
+    try:
+        with path.open(encoding="utf-8-sig" if encoding.lower() in {"utf-8", "utf8"} else encoding) as file:
+            line = file.readline(1 << 16)
+    except LookupError:
+        raise ConfigError(f"unknown encoding {encoding!r}.", todo="Give one such as utf-8 or cp1252.") from None
+    unquoted = re.sub(r'"[^"]*"', "", line)
+    delimiter = delimiter or max(_DELIMITERS, key=unquoted.count)
+    names = next(csv.reader([line], delimiter=delimiter), [])
+    if len(names) < 2:  # noqa: PLR2004  (a code needs a position)
+        raise InputError(
+            "the first line names no columns.", where=str(path), todo="Give a CSV file with a header, or the delimiter."
+        )
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"columns {', '.join(twice)[:200]} are there twice.", where=str(path), todo="Rename them.")
+    return names, delimiter

@@ -1,0 +1,72 @@
+"""geofleet's own `signs` table back from GeoJSON, GeoPackage, FlatGeobuf or whatever it was exported to."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import shapely
+
+from geofleet.errors import InputError
+from geofleet.formats.inventory_columns import numbers, parse_times, texts
+from geofleet.formats.inventory_files import CRS84
+from geofleet.formats.positions import to_lonlat
+from geofleet.formats.reading import LayerRead
+from geofleet.tables.schemas import SIGNS
+from geofleet.tables.store import build_table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from geofleet.formats.inventory_files import Features
+    from geofleet.tables.schemas import Column
+
+_NAMES = tuple(column.name for column in SIGNS.columns if not column.nullable)
+
+
+def is_own_layer(table: pa.Table) -> bool:
+    """Tell whether a table has every column that a `signs` table must have."""
+    return set(_NAMES) <= set(table.column_names)
+
+
+def own_layer(path: Path, features: Features, crs: Any = None) -> LayerRead:
+    """Return a `signs` table exported before, as it was; columns that the schema does not know are left out.
+
+    Raises
+    ------
+    InputError
+        A geometry is no point or has no valid position: no export of ours has such.
+    """
+    geometry = features.geometry
+    is_point = np.zeros(features.table.num_rows, bool) if geometry is None else shapely.get_type_id(geometry) == 0
+    if geometry is None or not is_point.all():
+        raise InputError(
+            f"a layer of signs, but {int((~is_point).sum())} of {len(is_point)} rows are no points.",
+            where=str(path),
+            todo="Export it again.",
+        )
+    place = (shapely.get_x(geometry), shapely.get_y(geometry))
+    lon, lat = to_lonlat(*place, crs or features.crs or CRS84, where=str(path))
+    if np.isnan(lon).any():
+        raise InputError(
+            f"{int(np.isnan(lon).sum())} positions are not valid.", where=str(path), todo="Export it again."
+        )
+    names = features.table.column_names
+    columns = {c.name: _values(features.table, c) for c in SIGNS.all_columns if c.name in names}
+    left = sum(name not in columns for name in names)
+    found = {"columns that are none of the signs table": left} if left else {}
+    return LayerRead(
+        build_table(SIGNS, columns, (lon, lat)), features.file_format, features.skipped, features.found | found
+    )
+
+
+def _values(table: pa.Table, column: Column) -> Any:
+    """Return a column in the type of the schema; formats without that type hold it as text."""
+    if pa.types.is_timestamp(column.type):
+        return pa.array(parse_times(table[column.name])[0], column.type)
+    if pa.types.is_string(column.type):
+        text = texts(table, column.name)
+        return text if column.nullable else [value or "" for value in text]
+    number = numbers(table, column.name)
+    return pa.array(number, from_pandas=True).cast(column.type)

@@ -1,0 +1,146 @@
+"""Where the features of an inventory are: one point each, in degrees, or the reason why there is none."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+
+from geofleet.errors import InputError
+from geofleet.formats.inventory_columns import numbers, texts
+from geofleet.formats.inventory_files import CRS84
+from geofleet.formats.positions import reject_null_island, to_lonlat
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from geofleet.formats.inventory_columns import InventoryColumns
+    from geofleet.formats.inventory_files import Features
+
+    Floats = NDArray[np.float64]
+
+_POINT, _MULTIPOINT = 0, 4  # shapely.get_type_id
+_LINES = (1, 2, 5)
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Points of features.
+
+    Parameters
+    ----------
+    feature
+        Row of the file that each point belongs to, shape (n,); a multipoint gives several.
+    lon, lat
+        Degrees, all valid, shape (n,).
+    is_extended
+        The feature is a line or an area, which the point stands for, shape (n,).
+    skipped, found
+        What was left out and why; what else is worth telling.
+    """
+
+    feature: NDArray[np.int64]
+    lon: Floats
+    lat: Floats
+    is_extended: NDArray[np.bool_]
+    skipped: dict[str, int]
+    found: dict[str, int]
+
+
+def place_features(
+    path: Path, features: Features, chosen: InventoryColumns, *, crs: Any = None, swap_xy: bool = False
+) -> Places:
+    """Return the points of features.
+
+    Parameters
+    ----------
+    path
+        For messages.
+    features, chosen
+        Rows and geometry, and the columns that hold coordinates where there is no geometry.
+    crs
+        Overrides the CRS of the file; without either it is OGC:CRS84.
+    swap_xy
+        The file gives y before x.
+
+    Raises
+    ------
+    InputError
+        There are neither geometries nor columns of coordinates, or the positions contradict the CRS.
+    """
+    skipped: Counter[str] = Counter()
+    geometry = features.geometry if features.geometry is not None else _written(features, chosen, skipped)
+    if geometry is not None:
+        feature, x, y, is_extended = _points(geometry, skipped)
+    else:
+        if not (chosen.x and chosen.y):
+            raise InputError(
+                f"no geometry, and no columns that look like coordinates; there are "
+                f"{', '.join(features.table.column_names)[:300]}.",
+                where=str(path),
+                todo='Name them: columns={"x": …, "y": …}.',
+            )
+        x, y = numbers(features.table, chosen.x), numbers(features.table, chosen.y)
+        feature, is_extended = np.arange(len(x)), np.zeros(len(x), bool)
+    x, y = (y, x) if swap_xy else (x, y)
+    lon, lat = to_lonlat(x, y, crs or features.crs or CRS84, where=str(path))
+    finite = np.isfinite(x) & np.isfinite(y)
+    skipped["coordinates that are no number"] += int((~finite).sum())
+    skipped["coordinates out of range"] += int((finite & np.isnan(lon)).sum())
+    kept = np.flatnonzero(~np.isnan(lon))
+    null = reject_null_island(lon[kept], lat[kept], where=str(path))
+    skipped["at 0° N 0° E, in the Gulf of Guinea"] += int(null.sum())
+    kept = kept[~null]
+    assumed = crs is None and features.crs is None
+    found = {"no CRS stated, taken as OGC:CRS84": len(kept)} if assumed else {}
+    reasons = {reason: count for reason, count in skipped.items() if count}
+    return Places(feature[kept], lon[kept], lat[kept], is_extended[kept], reasons, found)
+
+
+def _written(features: Features, chosen: InventoryColumns, skipped: Counter[str]) -> NDArray[np.object_] | None:
+    """Return the geometries that a column of well-known text holds, None without such a column."""
+    if not chosen.geometry:
+        return None
+    text = np.array(texts(features.table, chosen.geometry), object)
+    shapes = np.asarray(shapely.from_wkt(text, on_invalid="ignore"), object)
+    skipped["geometries that are no well-known text"] += int((shapely.is_missing(shapes) & (text != None)).sum())  # noqa: E711  (elementwise)
+    return shapes
+
+
+def _points(
+    geometry: NDArray[np.object_], skipped: Counter[str]
+) -> tuple[NDArray[np.int64], Floats, Floats, NDArray[np.bool_]]:
+    """Return feature, x, y and whether it stands for a line or an area, of every point."""
+    absent = shapely.is_missing(geometry) | shapely.is_empty(geometry)
+    skipped["without a geometry"] += int(absent.sum())
+    feature = np.flatnonzero(~absent)
+    parts, owner = geometry[feature], np.arange(len(feature))
+    many = shapely.get_type_id(parts) == _MULTIPOINT
+    split, of_split = shapely.get_parts(parts[many], return_index=True)
+    owner = np.concatenate((owner[~many], owner[many][of_split]))
+    shapes = np.concatenate((parts[~many], split))
+    order = np.argsort(owner, kind="stable")
+    shapes, feature = shapes[order], feature[owner[order]]
+    kind = shapely.get_type_id(shapes)
+    is_extended = kind != _POINT
+    for index in np.flatnonzero(is_extended):
+        shapes[index] = _middle(shapes[index], is_line=int(kind[index]) in _LINES)
+    lost = shapely.is_missing(shapes) | shapely.is_empty(shapes)
+    skipped["geometries without a point on them"] += int(lost.sum())
+    shapes, feature, is_extended = shapes[~lost], feature[~lost], is_extended[~lost]
+    return feature.astype(np.int64), shapely.get_x(shapes), shapely.get_y(shapes), is_extended
+
+
+def _middle(shape: Any, *, is_line: bool) -> Any:
+    """Return the middle of a line or a point within an area, None where its coordinates allow neither."""
+    try:
+        if is_line:
+            return shapely.line_interpolate_point(shapely.line_merge(shape), 0.5, normalized=True)
+        return shapely.point_on_surface(shape)
+    except (shapely.GEOSException, TypeError, ValueError):
+        return None
