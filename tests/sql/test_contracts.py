@@ -29,13 +29,14 @@ def connection():
 
 
 def bind_empty(connection: duckdb.DuckDBPyConnection, name: str) -> None:
-    """Register an empty table for a schema name, or for the result of another statement (`@folder/name`)."""
+    """Register an empty table for a schema name (`signs`, `signs AS fused`), or for a statement's result (`@a/b`)."""
     if name.startswith("@"):
         statement = load_sql(name.removeprefix("@"))
         columns = ", ".join(f"{column} {kind}" for column, kind in statement.writes)
         connection.execute(f"CREATE TABLE {name.rpartition('/')[2]} ({columns})")
     else:
-        connection.register(name, SCHEMAS[name].arrow().empty_table())
+        schema, _, alias = name.partition(" AS ")
+        connection.register(alias or schema, SCHEMAS[schema].arrow().empty_table())
 
 
 def sample_params(text: str, params: tuple[str, ...]) -> dict[str, Any]:
