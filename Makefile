@@ -82,7 +82,7 @@ $(P)/report/_manifest.json: $(P)/evaluation/_manifest.json $(P)/lanes/lanes_mani
 	$(GEOFLEET) report $(P)
 
 test: $(READY) ## Set up and pass every test
-	$(BIN)/pytest -q
+	$(BIN)/pytest -q -n 2 --dist loadfile
 
 check: $(READY) ## Every gate: format, lint, types, import direction, SQL contracts
 	$(BIN)/ruff format --check .

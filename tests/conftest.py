@@ -4,10 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.tables.schemas import SIGNS
 from geofleet.tables.store import build_table
+
+# No clock: a busy machine is no failure. No luck: the same examples every time.
+settings.register_profile("geofleet", deadline=None, derandomize=True)
+settings.load_profile("geofleet")
 
 HELSINKI = EnuFrame(24.9450453, 60.1677108)
 REPO = Path(__file__).resolve().parent.parent

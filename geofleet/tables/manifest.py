@@ -1,6 +1,6 @@
 """The manifest of a step: what it read, with which settings and versions, and what it wrote. Always written last.
 
-It holds no clock and no absolute path, so the same work gives the same bytes.
+It holds no clock and no path, so the same work gives the same bytes.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def write_manifest(
     path = manifest_path(out)
     content = {
         "step": step,
-        "inputs": {p.name: hash_path(p) for p in sorted(inputs)},
-        "outputs": {out.name: hash_path(out)},
+        "inputs": [{"name": p.name, "sha256": hash_path(p)} for p in sorted(inputs)],
+        "output_sha256": hash_path(out),
         "config_digest": config_digest,
         "settings": dict(settings or {}),
         "counts": dict(counts or {}),

@@ -18,8 +18,9 @@ from geofleet.workflows.demo import N_VEHICLES, demo_result, run_demo
 if TYPE_CHECKING:
     from pathlib import Path
 
-GOLDEN_F1 = 0.0
-GOLDEN_GOSPA_M = 0.0
+# 28 found, 2 false, 5 missed of 33 signs; seed 0, 50 vehicles
+GOLDEN_F1 = 8 / 9
+GOLDEN_GOSPA_M = 0.809790
 TABLES = {
     "signs/signs.parquet": "signs",
     "lanes/lanes.parquet": "lanes",

@@ -1,0 +1,100 @@
+"""The paper's Figure 5 (GOSPA_M over fleet size) on the shipped drives, beside the paper's own points.
+
+    python benchmarks/paper_figure5.py --scenario paper --seed 1 --replicates 24
+    python benchmarks/paper_figure5.py --drive data/raw/helsinki_derived_b.pos --in-view
+
+Detections are simulated; signs and roads are real (© OpenStreetMap contributors, ODbL), the drives derived.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pyarrow.compute as pc
+
+from geofleet.config import load_config
+from geofleet.steps.aggregate import aggregate
+from geofleet.steps.evaluate import evaluate
+from geofleet.steps.ingest import ingest_drive, ingest_signs
+from geofleet.steps.simulate import simulate
+from geofleet.tables.schemas import REFERENCE, SIGNS
+from geofleet.tables.store import read_table, write_table
+
+RAW = Path(__file__).parent.parent / "data" / "raw"
+# Paper, Figures 3 and 5: fleet size, F1, GOSPA_M and its standard deviation over ten runs, metres.
+PAPER = np.array(
+    [
+        (5, 0.7495, 1.5400, 0.4610),
+        (10, 0.8345, 1.2694, 0.2525),
+        (15, 0.8677, 1.1335, 0.2123),
+        (20, 0.8935, 1.1013, 0.2207),
+        (25, 0.9149, 1.0145, 0.2173),
+        (30, 0.9149, 0.9324, 0.2132),
+        (35, 0.9255, 0.9050, 0.1154),
+        (40, 0.9271, 0.8158, 0.2043),
+        (45, 0.9143, 0.8407, 0.1485),
+        (50, 0.9300, 0.7802, 0.1274),
+    ]
+)
+
+
+def scores(folder: Path, args: argparse.Namespace) -> list[dict[str, object]]:
+    """Simulate every replicate once and return the totals of every fleet size."""
+    config = load_config(args.scenario, args.set)
+    ingest_signs([RAW / "helsinki.osm.pbf"], folder / "signs.parquet")
+    ingest_drive([args.drive], folder / "drives.parquet")
+    simulation = folder / "simulation"
+    simulate(
+        *(folder / "signs.parquet", folder / "drives.parquet", simulation),
+        config=config,
+        n_vehicles=50,
+        n_replicates=args.replicates,
+        seed=args.seed,
+    )
+    reference = simulation / "reference.parquet"
+    if args.in_view:
+        seen = read_table(REFERENCE, reference).filter(pc.field("n_passes_in_view") > 0)
+        reference = folder / "seen.parquet"
+        write_table(SIGNS, seen.drop_columns(["n_passes_in_view", "n_frames_in_view"]), reference)
+    totals: list[dict[str, object]] = []
+    for size in PAPER[:, 0].astype(int).tolist():
+        fused = folder / f"fused-{size}.parquet"
+        aggregate(simulation / "detections", fused, config=config, n_vehicles=size)
+        totals += evaluate(fused, reference, folder / f"evaluation-{size}", config=config).totals
+    return totals
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", default="paper")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--replicates", type=int, default=24)
+    parser.add_argument("--drive", type=Path, default=RAW / "helsinki_derived.pos")
+    parser.add_argument("--in-view", action="store_true", help="leave out signs that no pass had in view")
+    args = parser.parse_args()
+    with TemporaryDirectory() as name:
+        totals = scores(Path(name), args)
+    print(f"{args.scenario}, seed {args.seed}, {args.replicates} replicates, {args.drive.name}")
+    print(" V   F1 (paper)     tp   fp   fn   GOSPA_M mean sd median (paper mean sd)   z")
+    inside = 0
+    for size, paper_f1, paper_mean, paper_sd in PAPER:
+        rows = [total for total in totals if total["n_vehicles"] == size]
+        gospa_m, f1, tp, fp, fn = (
+            np.array([row[name] for row in rows], float) for name in ("gospa_m", "f1", "tp", "fp", "fn")
+        )
+        z = (gospa_m.mean() - paper_mean) / paper_sd
+        inside += abs(z) <= 1
+        print(
+            f"{size:3.0f}  {f1.mean():.3f} ({paper_f1:.3f})  {tp.mean():5.1f}{fp.mean():5.1f}{fn.mean():5.1f}"
+            f"   {gospa_m.mean():.3f} {gospa_m.std(ddof=1):.3f} {np.median(gospa_m):.3f}"
+            f"  ({paper_mean:.3f} {paper_sd:.3f})  {z:+.2f}"
+        )
+    print(f"within the paper's mean ± 1 sd: {inside} of {len(PAPER)} fleet sizes")
+
+
+if __name__ == "__main__":
+    main()
