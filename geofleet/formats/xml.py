@@ -19,7 +19,7 @@ from geofleet.errors import InputError
 from geofleet.formats.reading import GZIP, read_head
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Generator, Iterator
     from pathlib import Path
     from typing import BinaryIO
 
@@ -40,6 +40,17 @@ class Element(_PlainElement):
 
     __slots__ = ("line",)
     line: int
+
+    if TYPE_CHECKING:  # what is in an element is of its kind; the methods are those of the base class
+
+        def find(  # noqa: D102 - typing only
+            self, path: str, namespaces: dict[str, str] | None = None
+        ) -> Element | None: ...
+        def findall(  # type: ignore[override]  # noqa: D102 - typing only; a list of these is what it returns
+            self, path: str, namespaces: dict[str, str] | None = None
+        ) -> list[Element]: ...
+        def iter(self, tag: str | None = None) -> Generator[Element, None, None]: ...  # noqa: D102 - typing only
+        def __iter__(self) -> Iterator[Element]: ...
 
 
 def root_tag(head: bytes) -> str:
