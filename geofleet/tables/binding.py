@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 _NUMBERS = ("INT", "DOUBLE", "FLOAT", "DECIMAL", "HUGEINT")
 
 
-def bind_table(connection: duckdb.DuckDBPyConnection, schema: Schema, path: Path) -> None:
-    """Make a view named after the schema of a Parquet file, or of a hive-partitioned folder of them.
+def bind_table(connection: duckdb.DuckDBPyConnection, schema: Schema, path: Path, *, name: str = "") -> None:
+    """Make a view of a Parquet file, or of a hive-partitioned folder of them, named `name` or after the schema.
 
     Partition values stay text: DuckDB's own hive reader would take vehicle `007` for the number 7.
 
@@ -42,11 +42,11 @@ def bind_table(connection: duckdb.DuckDBPyConnection, schema: Schema, path: Path
             where=str(path),
             todo=f"A {schema.name} table is expected; `geofleet ingest` makes one from other formats.",
         ) from None
-    absent = [name for name in schema.partitions if name not in view.columns] if path.is_dir() else []
-    values = [f"url_decode(regexp_extract(filename, '/{name}=([^/]*)/', 1)) AS {name}" for name in absent]
+    absent = [key for key in schema.partitions if key not in view.columns] if path.is_dir() else []
+    values = [f"url_decode(regexp_extract(filename, '/{key}=([^/]*)/', 1)) AS {key}" for key in absent]
     view = view.project(", ".join(["* EXCLUDE (filename)", *values]))
     _check(connection, schema, view, path)
-    view.create_view(schema.name, replace=True)
+    view.create_view(name or schema.name, replace=True)
 
 
 def _check(connection: duckdb.DuckDBPyConnection, schema: Schema, view: duckdb.DuckDBPyRelation, path: Path) -> None:

@@ -1,7 +1,7 @@
 """The steps as functions of GeoDataFrames, under the names of the command line.
 
-Every frame is in OGC:CRS84 when it comes out and in any CRS when it goes in. A call runs the same step on the same tables
-as the command does, in a temporary folder, so both give the same numbers.
+Every frame is in OGC:CRS84 when it comes out and in any CRS when it goes in. A call runs the same step on the same
+tables as the command does, in a temporary folder, so both give the same numbers.
 """
 
 from __future__ import annotations
@@ -122,9 +122,7 @@ def aggregate(
         return _read(SIGNS, out)
 
 
-def score_map(
-    map_: GeoDataFrame, reference: GeoDataFrame, *, gate_m: float = 2.0, match_on: str = "class"
-) -> MapScore:
+def score_map(map_: GeoDataFrame, reference: GeoDataFrame, *, gate_m: float = 2.0, match_on: str = "class") -> MapScore:
     """Score the main signs of a map against a reference (paper, eq. GOSPA_M; DOI 10.23919/ICIF.2017.8009645).
 
     Parameters

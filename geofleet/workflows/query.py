@@ -9,7 +9,9 @@ import duckdb
 import pyarrow.parquet as pq
 
 from geofleet.errors import InputError, QueryError
+from geofleet.tables.binding import bind_table
 from geofleet.tables.database import connect
+from geofleet.tables.schemas import SCHEMAS, Schema
 
 _MARK = b"geofleet:table"
 
@@ -36,8 +38,8 @@ def query(statement: str, data: Path) -> tuple[tuple[str, ...], list[tuple[Any, 
     text = _read_statement(statement)
     connection = connect()
     try:
-        for name, pattern in views.items():
-            connection.read_parquet(pattern, hive_partitioning=True).create_view(name)
+        for name, (schema, path) in views.items():
+            bind_table(connection, schema, path, name=name)
         result = connection.execute(text)
         names = tuple(column[0] for column in result.description or ())
         return names, result.fetchall()
@@ -47,15 +49,16 @@ def query(statement: str, data: Path) -> tuple[tuple[str, ...], list[tuple[Any, 
         connection.close()
 
 
-def find_tables(data: Path) -> dict[str, str]:
-    """Return name and file pattern of every geofleet table below a folder, by name."""
-    views: dict[str, str] = {}
+def find_tables(data: Path) -> dict[str, tuple[Schema, Path]]:
+    """Return schema and path of every geofleet table below a folder, by the name of its view."""
+    views: dict[str, tuple[Schema, Path]] = {}
     for path in sorted(data.rglob("*.parquet")):
-        if _MARK not in (pq.read_metadata(path).metadata or {}):
+        mark = (pq.read_metadata(path).metadata or {}).get(_MARK, b"").decode()
+        if mark not in SCHEMAS:
             continue
         levels = [parent for parent in path.parents if "=" in parent.name]
-        root = levels[-1].parent if levels else None
-        views.setdefault(root.name if root else path.stem, f"{root}/**/*.parquet" if root else str(path))
+        root = levels[-1].parent if levels else path
+        views.setdefault(root.stem, (SCHEMAS[mark], root))
     return views
 
 

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import pyarrow.compute as pc
 import pytest
-from geofleet.steps.aggregate import aggregate
 
 from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.config import load_config
+from geofleet.steps.aggregate import aggregate
 from geofleet.tables.manifest import hash_path
 from geofleet.tables.schemas import DETECTIONS, DRIVES, MATCHES, PASSES, REFERENCE, RUNS, SCHEMAS, SCORES, SIGNS, TRUTH
 from geofleet.tables.store import lonlat, read_table
