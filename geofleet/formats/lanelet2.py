@@ -195,7 +195,7 @@ def _facings(map_: LaneletMap, rows: list[_Row]) -> tuple[Floats, list[str | Non
         if row.kind not in _MARKINGS:
             facing[index] = looks
             along += int(np.isnan(looks))
-    return facing, road_id, {"signs and lights drawn along their lane, facing unknown": along}
+    return facing, road_id, {"signs and lights whose line does not show which way they face": along}
 
 
 def _heights(map_: LaneletMap, rows: list[_Row], lon: Floats, lat: Floats) -> Floats:
