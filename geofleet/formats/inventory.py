@@ -21,6 +21,7 @@ from geofleet.formats.inventory_layer import is_own_layer, own_layer
 from geofleet.formats.inventory_places import Places, place_features
 from geofleet.formats.positions import country_at, doubts
 from geofleet.formats.reading import LayerRead
+from geofleet.formats.xml import explained
 from geofleet.tables.schemas import SIGNS
 from geofleet.tables.store import build_table
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from geofleet.formats.inventory_codes import Plates
     from geofleet.formats.inventory_columns import InventoryColumns
+    from geofleet.formats.inventory_files import Features
 
 __all__ = ["detect", "read_signs"]
 
@@ -76,15 +78,21 @@ def read_signs(path: Path, *, columns: Mapping[str, str] | Path | None = None, *
     Raises
     ------
     InputError
-        The file is missing, empty, damaged or of another format, no column holds codes, or the positions contradict
-        the CRS or the country.
+        The file is missing, empty, damaged or of another format, no column holds codes, the CRS is
+        unknown, or the positions contradict it or the country.
     ConfigError
-        An option, column or CRS given is unknown.
+        An option or a column given is unknown.
     """
     named, options = _settled(columns, options)
-    features = read_features(path, **{k: options[k] for k in ("layer", "encoding", "delimiter") if k in options})
-    if is_own_layer(features.table):
-        return own_layer(path, features, options.get("crs"))
+    with explained(path):
+        features = read_features(path, **{k: options[k] for k in ("layer", "encoding", "delimiter") if k in options})
+        if is_own_layer(features.table):
+            return own_layer(path, features, options.get("crs"))
+        return _read(path, features, named, options)
+
+
+def _read(path: Path, features: Features, named: Mapping[str, str], options: Mapping[str, Any]) -> LayerRead:
+    """Return the signs of the rows of a file."""
     chosen, guessed = choose_columns(features.table.column_names, named, has_geometry=features.geometry is not None)
     if not chosen.code:
         raise InputError(

@@ -94,6 +94,7 @@ _EPOCH_MS, _EPOCH_S = 1e11, 1e8
 _MONTHS, _LAST_YEAR = 12, 9999
 _PREVAILING = 0.95
 _MAX_TEXT_BYTES = 1 << 20
+_SHAPEFILE_NAME = 10  # letters of a column name
 
 
 def read_options(path: Path) -> dict[str, Any]:
@@ -144,12 +145,19 @@ def choose_columns(
     for thing in things:
         if thing in asked or (has_geometry and thing in _PLACES):
             continue
-        free = (plain[name] for name in _NAMES[thing].split() if name in plain and plain[name] not in taken)
+        wanted = [*_NAMES[thing].split(), *_cut_names(_NAMES[thing].split(), plain)]
+        free = (plain[name] for name in wanted if name in plain and plain[name] not in taken)
         name = next(free, "")
         if name:
             guessed[thing] = name
             taken.add(name)
     return InventoryColumns(**asked, **guessed), tuple(guessed)
+
+
+def _cut_names(wanted: Sequence[str], plain: Mapping[str, str]) -> list[str]:
+    """Return the columns that a Shapefile, which keeps ten letters, may have cut one of the wanted names to."""
+    cut = [key for key, name in plain.items() if len(name) == _SHAPEFILE_NAME]
+    return [key for key in cut if any(name.startswith(key) for name in wanted)]
 
 
 def texts(table: pa.Table, name: str) -> list[str | None]:

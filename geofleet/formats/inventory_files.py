@@ -34,6 +34,10 @@ _SEQUENCE = re.compile(rb'(?:\x1e|\s*\{[^\n]*"Feature"[^\n]*\}\s*\n\s*\{)')
 _CRS_NAME = re.compile(
     rb'"crs"\s*:\s*\{\s*(?:"type"\s*:\s*"([a-z]+)"\s*,\s*)?"properties"\s*:\s*\{\s*"\w+"\s*:\s*"([^"]*)"'
 )
+_DRIVERS = {"geojson": "GeoJSON:", "geojsonseq": "GeoJSONSeq:"}
+_SUFFIXES = {"gpkg": ".gpkg", "flatgeobuf": ".fgb", "shapefile": ".shp"}  # where no prefix names the driver
+# Dates stay text: GDAL reads 1/2/2022 by its own rule, which the user cannot override
+_OPEN_OPTIONS = {"geojson": {"DATE_AS_STRING": "YES"}, "geojsonseq": {"DATE_AS_STRING": "YES"}}
 _MAX_UNPACKED_BYTES = 4 << 30
 _CSV_BLOCK_BYTES = 16 << 20
 _DELIMITERS = ";\t|,"
@@ -132,36 +136,36 @@ def read_features(
 
 def _read_gdal(path: Path, found: str, layer: str | None) -> Features:
     import pyogrio  # noqa: PLC0415  (loads GDAL, which only these formats need)
-    from pyogrio.errors import CRSError, DataLayerError, DataSourceError, FieldError, GeometryError  # noqa: PLC0415
 
-    source, skipped = _gdal_source(path, found)
+    _check_name(path, found)
+    source = _zipped_shapefile(path) if found == "shapefile.zip" else _DRIVERS.get(found, "") + str(path.resolve())
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         try:
             layer, n_others = _layer(source, path, layer)
-            meta, table = pyogrio.read_arrow(source, layer=layer, **_open_options(found))
-        except (DataSourceError, DataLayerError, CRSError, FieldError, GeometryError, RuntimeError) as error:
+            meta, table = pyogrio.read_arrow(source, layer=layer, **_OPEN_OPTIONS.get(found, {}))
+        except (InputError, ConfigError):
+            raise
+        except Exception as error:  # noqa: BLE001  (a damaged file makes the binding fail in any way, even by NameError)
             raise InputError(f"damaged or not {found} ({str(error)[:300]}).", where=str(path), todo=_TODO) from None
     name = meta["geometry_name"] or "wkb_geometry"
     notes = {f"GDAL warned: {str(warning.message)[:200]}": 1 for warning in told}
     if n_others:
         notes["layers not read"] = n_others
     if name not in table.column_names:
-        return Features(table, None, None, found, skipped, notes)
+        return Features(table, None, None, found, {}, notes)
     crs = meta["crs"]
     if found in {"geojson", "geojsonseq"}:
         crs = _geojson_crs(path) or CRS84
     geometry = shapely.from_wkb(table[name].to_numpy(zero_copy_only=False), on_invalid="ignore")
-    return Features(table.drop_columns([name]), np.asarray(geometry, object), crs, found, skipped, notes)
+    return Features(table.drop_columns([name]), np.asarray(geometry, object), crs, found, {}, notes)
 
 
-def _gdal_source(path: Path, found: str) -> tuple[str, dict[str, int]]:
-    """Return the path as GDAL wants it, with the driver where it can be named."""
-    absolute = str(path.resolve())
-    if found == "shapefile.zip":
-        return _zipped_shapefile(path), {}
-    prefix = {"geojson": "GeoJSON:", "geojsonseq": "GeoJSONSeq:"}.get(found, "")
-    return prefix + absolute, {}
+def _check_name(path: Path, found: str) -> None:
+    """Refuse a name that GDAL, which goes by it, would take for that of another format."""
+    suffix = _SUFFIXES.get(found, "")
+    if suffix and path.suffix.lower() != suffix:
+        raise InputError(f"the content is {found}, the name is not.", where=str(path), todo=f"Rename it to …{suffix}.")
 
 
 def _zipped_shapefile(path: Path) -> str:
@@ -183,11 +187,6 @@ def _zipped_shapefile(path: Path) -> str:
             todo="Unpack it and give the file.",
         )
     return f"/vsizip/{{{path.resolve()}}}/{names[0]}"
-
-
-def _open_options(found: str) -> dict[str, Any]:
-    # Dates stay text: GDAL reads 1/2/2022 by its own rules, which the user cannot override
-    return {"DATE_AS_STRING": "YES"} if found == "geojson" else {}
 
 
 def _layer(source: str, path: Path, layer: str | None) -> tuple[str, int]:
@@ -294,7 +293,8 @@ def _read_csv(path: Path, encoding: str | None, delimiter: str | None) -> Featur
 
     def count(row: Any) -> str:
         bad.append(row.actual_columns)
-        return "skip"
+        is_open = (row.text or "").count('"') % 2  # a quote never closed makes one row of all that follow
+        return "error" if is_open else "skip"
 
     table = arrow_csv.read_csv(
         path,
