@@ -505,7 +505,8 @@ def write_layer(name, path, table):
     "content",
     [
         b"", b"\x00" * 100, b"<osm/>", b"{}", b"[", b"[" * 100_000, b'{"type":"FeatureCollection"}', b"PAR1",
-        b"fgb\x03", b"PK\x03\x04", b"SQLite format 3\x00", b"\x00\x00\x27\x0a", b"code", b"code,lon,lat", b"a,a,b\n1,2,3\n",
+        b"fgb\x03", b"PK\x03\x04", b"SQLite format 3\x00", b"\x00\x00\x27\x0a", b"code", b"code,lon,lat",
+        b"a,a,b\n1,2,3\n",
         b'code,lon,lat\n"B1,3,51\nB1,3,51\n', b"\xff\xfe\x00", b"id,lon,lat\n1,3,51\n",
         b'{"type":"gdal_streamed_alg","command_line":"gdal vector pipeline ! read x.gpkg"}',
     ],
