@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from geofleet.formats.opendrive_georef import read_georeference
 from geofleet.formats.opendrive_lanes import LaneLines, read_lane_lines
 from geofleet.formats.opendrive_signals import BEYOND, NO_ROAD, TWICE, SignalReader, main_sign_of, read_pole
 from geofleet.formats.opendrive_xml import ROOT, children, header_and_roads, in_road, read_road
+from geofleet.formats.positions import doubts
 from geofleet.formats.reading import LayerRead
 from geofleet.formats.xml import explained, root_tag
 from geofleet.tables.schemas import LANES, SIGNS
@@ -89,16 +90,17 @@ def read_signs(
         facing = _facing_deg(georeference, x, y, heading)
         support = _supports(placed, x, y, poles, roads)
     columns = _columns(placed, path.name) | {"height_m": height, "facing_deg": facing, "support_id": support}
-    counts = {
+    counts = reader.found | {
         "unknown codes": sum(not signal.meaning.known for signal in placed.values()),
         "plates without a main sign": sum(
             signal.kind == "plate" and parent is None
             for signal, parent in zip(placed.values(), columns["parent_id"], strict=True)
         ),
     }
-    return LayerRead(
-        build_table(SIGNS, columns, (lon, lat)), FORMAT, dict(reader.skipped), _positive(reader.found | counts)
-    )
+    countries = Counter(signal.country for signal in placed.values() if signal.country)
+    usual = countries.most_common(1)[0][0] if countries else None
+    counts |= doubts(lon, lat, usual, where=str(path))
+    return LayerRead(build_table(SIGNS, columns, (lon, lat)), FORMAT, dict(reader.skipped), _positive(counts))
 
 
 def read_lanes(path: Path, *, crs: str | None = None, origin: tuple[float, float] | None = None) -> LayerRead:

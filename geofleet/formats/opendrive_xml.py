@@ -34,7 +34,7 @@ _MAX_ROAD_M = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Road:
-    """Geometry of a road: reference line, profiles of height and tilt, length in metres."""
+    """Geometry of a road: reference line, profiles of height and tilt, length in metres (that of the line itself)."""
 
     road_id: str
     plan: PlanView
@@ -82,7 +82,7 @@ def read_road(element: Element) -> Road:
         plan,
         profile(children(element, "elevationProfile", "elevation")),
         profile(children(element, "lateralProfile", "superelevation")),
-        max(length, plan.end_m),
+        plan.end_m,
     )
 
 
