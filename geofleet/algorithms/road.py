@@ -134,7 +134,7 @@ class RoadOutcomes:
             raise InputError(f"{outside} of {n} stations are not within 0 … {self.length_m} m", where="road")
         unknown = np.setdiff1d(self.outcome, _OUTCOMES)
         if unknown.size:
-            raise InputError(f"outcome {unknown[0]!r}", where="road", todo="Give TP, FP or FN.")
+            raise InputError(f"outcome {str(unknown[0])!r}", where="road", todo="Give TP, FP or FN.")
         of_tp = self.sq_distance_m2[self.outcome == "TP"]
         if not ((of_tp >= 0) & (of_tp < math.inf)).all():
             raise InputError("a TP has no squared distance", where="road", todo="Give one a TP, not negative.")

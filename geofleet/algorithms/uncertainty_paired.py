@@ -63,15 +63,15 @@ def compare_on_road(
     InputError
         The roads or the numbers of reference signs differ, or an option is out of range.
     """
-    check_options(level=level, gate_m=gate_m, correlation_m=correlation_m, block_m=block_m, n_draws=1)
+    check_options(level=level, gate_m=gate_m, correlation_m=correlation_m, block_m=block_m)
     _check_same_reference(a, b, score)
     block_m = block_m or ub.block_length_m(a.length_m, correlation_m)
     maps = [ub.sum_blocks(m.station_m, m.sums(), length_m=m.length_m, block_m=block_m) for m in (a, b)]
     values = [road_scores(blocks, gate_m)[score] for blocks in maps]
     difference = values[0] - values[1]
-    road = Resampled(maps[0], gate_m, level, 0, 0)
+    road = Resampled(maps[0], a.length_m, gate_m, level, 0, 0)
     words = f"{score} of map A minus that of map B on a longer road like this one"
-    how = f"Student's t over {len(maps[0])} paired blocks of {a.length_m / len(maps[0]):.0f} m"
+    how = f"Student's t over {len(maps[0])} paired blocks of {road.block_m:.0f} m"
     notes = [length_note(a.length_m, maps[0]), COMMON_OFFSET]
     reasons = [why_none(blocks) for blocks, value in zip(maps, values, strict=True) if math.isnan(value)]
     if reasons or len(maps[0]) < MIN_BLOCKS:

@@ -22,7 +22,8 @@ from scipy import stats
 
 from geofleet.algorithms import uncertainty_blocks as ub
 from geofleet.algorithms.metrics import null_reason
-from geofleet.algorithms.uncertainty import Interval, check_level, joined
+from geofleet.algorithms.uncertainty import MIN_DRAWS, Interval, check_level, joined
+from geofleet.algorithms.uncertainty_mean import tails
 from geofleet.errors import InputError
 
 if TYPE_CHECKING:
@@ -50,15 +51,24 @@ class Resampled:
     """One map on its blocks, and how intervals are to be made of it."""
 
     blocks: ub.Blocks
+    length_m: float
     gate_m: float
     level: float
     n_draws: int
     seed: int
 
     @property
-    def dof(self) -> int:
-        """Degrees of freedom of the variance between blocks."""
-        return len(self.blocks) - 1
+    def block_m(self) -> float:
+        """Length of a block, metres."""
+        return self.length_m / len(self.blocks)
+
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom of the variance between blocks; overlapping ones have half as many again as blocks apart.
+
+        Meketon and Schmeiser, "Overlapping batch means: something for nothing?", 1984.
+        """
+        return 1.5 * (len(self.blocks) - 1)
 
     @property
     def t(self) -> float:
@@ -106,7 +116,7 @@ def road_intervals(
     blocks = ub.sum_blocks(outcomes.station_m, outcomes.sums(), length_m=outcomes.length_m, block_m=block_m)
     if outcomes.sq_distance_m2[outcomes.outcome == "TP"].max(initial=0.0) > gate_m**2 * _ROUNDING:
         raise InputError(f"a TP is farther from its sign than the gate of {gate_m} m", where="road")
-    road = Resampled(blocks, gate_m, level, n_draws, seed)
+    road = Resampled(blocks, outcomes.length_m, gate_m, level, n_draws, seed)
     estimates = road_scores(blocks, gate_m)
     few = length_note(outcomes.length_m, blocks)
     if len(blocks) < MIN_BLOCKS:
@@ -128,15 +138,17 @@ def road_intervals(
     }
 
 
-def check_options(*, level: float, gate_m: float, correlation_m: float, block_m: float | None, n_draws: int) -> None:
+def check_options(
+    *, level: float, gate_m: float, correlation_m: float, block_m: float | None, n_draws: int = MIN_DRAWS
+) -> None:
     """Raise InputError when an option of an interval along a road is out of range."""
     check_level(level)
     lengths = {"gate": gate_m, "correlation length": correlation_m, "block": 1.0 if block_m is None else block_m}
     for name, length_m in lengths.items():
         if not 0 < length_m < math.inf:
             raise InputError(f"the {name} is {length_m} m", where="road", todo="Give a positive distance.")
-    if n_draws < 1:
-        raise InputError(f"{n_draws} bootstrap draws", where="road", todo="Give at least 1, better 1999.")
+    if n_draws < MIN_DRAWS:
+        raise InputError(f"{n_draws} bootstrap draws", where="road", todo=f"Give at least {MIN_DRAWS}, better 1999.")
 
 
 def f1_of(jaccard: float) -> float:
@@ -171,9 +183,11 @@ def _share_ends(road: Resampled, ratio: ub.Ratio) -> Ends:
         # without an error (or a hit) nothing shows how signs of a block hang together: take them for one
         width = z_sq / np.count_nonzero(blocks.apart @ ratio.below)
     half = math.sqrt(width * variance + width**2 / 4)
-    low, high = ((share + width / 2 + side * half) / (1 + width) for side in (-1, 1))
+    high = min((share + width / 2 + half) / (1 + width), 1.0)
+    # the two ends solve (1 + w) x² - (2 share + w) x + share² = 0: their product gives the low one without cancellation
+    low = share**2 / ((1 + width) * high)
     # at a share of 0 or 1 one end is the share itself, which rounding must not miss
-    return min(max(low, 0.0), share), max(min(high, 1.0), share)
+    return min(low, share), max(high, share)
 
 
 def _mse_ends(road: Resampled) -> Ends:
@@ -181,12 +195,10 @@ def _mse_ends(road: Resampled) -> Ends:
     mse = ub.estimate(road.blocks, ub.MSE)
     error = road.error(ub.influence(road.blocks, ub.MSE)) / mse
     roots = ub.log_roots(road.blocks, ub.MSE, n_draws=road.n_draws, seed=road.seed)
-    tail = (1 - road.level) / 2
-    # order statistics, not interpolated ones: an infinite root must stay infinite
-    least, most = np.quantile(roots, [tail, 1 - tail], method="inverted_cdf")
-    return mse * math.exp(-most * error), mse * math.exp(min(-least * error, 700.0)) if math.isfinite(
-        least
-    ) else math.inf
+    least, most = tails(roots, road.level)
+    # no pair is matched beyond the gate, so neither is a mean
+    log_high = min(math.log(mse) - least * error, 2 * math.log(road.gate_m))
+    return mse * math.exp(-most * error), max(math.exp(log_high), mse)
 
 
 def _gospa_m_ends(road: Resampled, mse_ends: Ends, jaccard_ends: Ends) -> Ends:
@@ -208,6 +220,7 @@ def _mover(a: float, b: float, correlation: float) -> float:
 
 
 def _words(name: str, road: Resampled) -> tuple[str, str]:
+    """Return the estimand and the method of an interval."""
     methods = {
         "mse_m2": "bootstrap-t on the logarithm",
         "rmse_m": "bootstrap-t on the logarithm",
@@ -215,7 +228,10 @@ def _words(name: str, road: Resampled) -> tuple[str, str]:
     }
     n = len(road.blocks)
     how = methods.get(name, "Wilson's interval at the effective number of signs")
-    return f"the {name} of the same procedure on a longer road like this one", f"{how}, {n} circular blocks"
+    return (
+        f"the {name} of the same procedure on a longer road like this one",
+        f"{how}, {n} circular blocks of {road.block_m:.0f} m",
+    )
 
 
 def _interval(name: str, road: Resampled, value: float, ends: Ends, few_blocks: str) -> Interval:
@@ -267,6 +283,6 @@ def _neighbours_note(name: str, road: Resampled) -> str:
     residual = blocks.apart @ (np.array(ratio.above) - ub.estimate(blocks, ratio) * np.array(ratio.below))
     spread = float(residual @ residual)
     lagged = float(residual[1:] @ residual[:-1]) / spread if spread else 0.0
-    if lagged <= 2 / math.sqrt(len(blocks)):
+    if lagged <= stats.norm.ppf(0.95) / math.sqrt(len(blocks)):
         return ""
     return f"neighbouring blocks still correlate ({lagged:.2f}): the interval is too short, give a larger correlation_m"
