@@ -37,7 +37,10 @@ if TYPE_CHECKING:
 ROAD_SCORES = ("precision", "recall", "f1", "mse_m2", "rmse_m", "gospa_m")
 """The scores that a longer road leaves as they are; GOSPA itself grows with the road."""
 
-COMMON_OFFSET = "an offset common to the whole map (datum, mean GNSS error) is in every block: no single map shows it"
+COMMON_OFFSET = (
+    "an offset common to the whole map (datum, mean GNSS error) is in every block: no single map shows it; "
+    "errors shared over more than a block make the interval too short"
+)
 
 MIN_BLOCKS = 3
 _FEW_BLOCKS = 10
