@@ -36,9 +36,8 @@ if TYPE_CHECKING:
 
 __all__ = ["detect", "read_signs"]
 
-_OPTIONS = frozenset(
-    {"crs", "scheme", "country", "separator", "day_first", "layer", "encoding", "delimiter", "swap_xy"}
-)
+FORMAT = "inventory"
+OPTIONS = frozenset({"crs", "scheme", "country", "separator", "day_first", "layer", "encoding", "delimiter", "swap_xy"})
 _OSM_KEYS = ("direction", "highway", "city_limit", "traffic_signals:direction")
 
 
@@ -122,9 +121,9 @@ def _settled(
     if isinstance(columns, Path):
         options = read_options(columns) | {name: value for name, value in options.items() if value is not None}
         named = options.pop("columns", {})
-    unknown = sorted(set(options) - _OPTIONS)
+    unknown = sorted(set(options) - OPTIONS)
     if unknown:
-        raise ConfigError(f"unknown option {', '.join(unknown)}.", todo=f"Options are {', '.join(sorted(_OPTIONS))}.")
+        raise ConfigError(f"unknown option {', '.join(unknown)}.", todo=f"Options are {', '.join(sorted(OPTIONS))}.")
     if not isinstance(named, Mapping) or not all(isinstance(name, str) for name in named.values()):
         raise ConfigError("the columns are no table of names.", todo='Write [columns] and below it code = "…".')
     return dict(named), options

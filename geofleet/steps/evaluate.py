@@ -133,8 +133,8 @@ def evaluate(
         The map and the reference have no run in common.
     """
     gate_m, match_on = config.evaluate.gate_m, config.evaluate.match_on
-    map_ = _main_signs(read_layer(map_path))
-    whole = _main_signs(read_table(REFERENCE, reference_path) if in_view else read_layer(reference_path))
+    map_ = _main_signs(read_layer(map_path).table)
+    whole = _main_signs(read_table(REFERENCE, reference_path) if in_view else read_layer(reference_path).table)
     reference = whole.filter(pc.field("n_passes_in_view") > 0) if in_view else whole
     pairs = list(_pairs(map_, reference, clip_m=clip_m))
     matches = pa.concat_tables(

@@ -6,23 +6,25 @@ The format of a file is recognised by its content. A table is written when every
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from geofleet.errors import InputError
-from geofleet.formats import drives, osm
+from geofleet.errors import ConfigError, InputError
+from geofleet.formats import drives, layers
 from geofleet.formats.reading import read_head
 from geofleet.tables.manifest import write_manifest
 from geofleet.tables.schemas import DRIVES, LANES, SIGNS
 from geofleet.tables.store import sort_by_key, write_table
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from geofleet.formats.reading import LayerRead
     from geofleet.tables.schemas import Schema
@@ -30,7 +32,6 @@ if TYPE_CHECKING:
     Progress = Callable[[int, int], None]
     Reader = Callable[[Path], LayerRead]
 
-SIGN_FORMATS = {osm.FORMAT: "OpenStreetMap (.osm.pbf, .osm, .osm.gz, .osm.bz2)"}
 DRIVE_FORMATS = {drives.FORMAT: "RTKLIB solution (.pos)"}
 
 
@@ -78,40 +79,67 @@ def ingest_signs(
     file_format: str = "auto",
     roads: bool = True,
     progress: Progress | None = None,
+    **options: Any,
 ) -> IngestResult:
     """Read sign maps into one `signs` table.
 
     Parameters
     ----------
     inputs
-        Files, each in a format of `SIGN_FORMATS`.
+        Files, each in a format of `geofleet.formats.layers.FORMATS`.
     out
         Parquet file to write.
     file_format
         `auto`, or the name of the format of all inputs.
     roads
-        Take road and, where the map does not say, facing from the nearest drivable way.
+        Take road and, where the map does not say, facing from the nearest drivable way (OpenStreetMap).
     progress
         Called with files done and in all.
+    options
+        Those of the format's reader, e.g. `crs`, `origin`, `utm`, `columns`, `scheme`, `country`.
 
     Raises
     ------
     InputError
         There is no input, or one is missing, damaged or in no known format; nothing is written.
+    ConfigError
+        An option is not for the format of an input.
     """
-    readers = {osm.FORMAT: lambda path: osm.read_signs(path, roads=roads)}
-    plan = _plan(inputs, file_format, SIGN_FORMATS, readers)
-    return _ingest(SIGNS, "kind", plan, out, progress=progress, settings={"roads": roads})
+    plan = _plan_layers(inputs, SIGNS, file_format=file_format, roads=roads, **options)
+    return _ingest(SIGNS, "kind", plan, out, progress=progress, settings=_plain({"roads": roads, **options}))
 
 
 def ingest_lanes(
-    inputs: Sequence[Path], out: Path, *, file_format: str = "auto", progress: Progress | None = None
+    inputs: Sequence[Path], out: Path, *, file_format: str = "auto", progress: Progress | None = None, **options: Any
 ) -> IngestResult:
-    """Read drivable roads into one `lanes` table; parameters and errors as `ingest_signs`."""
-    readers = {osm.FORMAT: osm.read_lanes}
-    return _ingest(
-        LANES, "kind", _plan(inputs, file_format, SIGN_FORMATS, readers), out, progress=progress, settings={}
-    )
+    """Read drivable roads and lanes into one `lanes` table; parameters and errors as `ingest_signs`."""
+    plan = _plan_layers(inputs, LANES, file_format=file_format, **options)
+    return _ingest(LANES, "kind", plan, out, progress=progress, settings=_plain(options))
+
+
+def _plan_layers(
+    inputs: Sequence[Path], schema: Schema, *, file_format: str, **options: Any
+) -> list[tuple[Path, str, Reader]]:
+    """Return path, format and reader of each input; every file is looked at before the first is read."""
+    if not inputs:
+        raise InputError("no input file is named.", todo=f"Supported are {layers.SUPPORTED}.")
+    if file_format not in {"auto", *layers.FORMATS}:
+        raise ConfigError(
+            f"unknown format {file_format!r}.", where="--format", todo=f"Supported are auto; {layers.SUPPORTED}."
+        )
+    paths = [Path(path) for path in inputs]
+    found = [layers.recognise(path) if file_format == "auto" else file_format for path in paths]
+    reader = partial(layers.read_layer, schema=schema, **options)
+    return [(path, name, partial(reader, file_format=name or "auto")) for path, name in zip(paths, found, strict=True)]
+
+
+def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that were given as what JSON can hold."""
+    return {
+        name: dict(v) if isinstance(v, Mapping) else str(v) if isinstance(v, Path) else v
+        for name, v in options.items()
+        if v is not None
+    }
 
 
 def ingest_drive(
@@ -125,17 +153,14 @@ def ingest_drive(
 
 
 def recognise(path: Path) -> str:
-    """Return the format of a file by its content, or "" when it is none of ours.
+    """Return the format of a drive by its content, or "" when it is none of ours.
 
     Raises
     ------
     InputError
         The file is missing, unreadable or empty.
     """
-    head = read_head(path)
-    if osm.detect(head):
-        return osm.FORMAT
-    return drives.FORMAT if drives.detect(head) else ""
+    return drives.FORMAT if drives.detect(read_head(path)) else ""
 
 
 def _plan(

@@ -21,8 +21,9 @@ from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import TrackerModel, Tracks, track_pass
 from geofleet.algorithms.trajectory import Poses, resample, wander
 from geofleet.errors import ConfigError, InputError
+from geofleet.formats.layers import read_layer
 from geofleet.tables.manifest import hash_path, write_manifest
-from geofleet.tables.scenes import Drive, Scene, load_drive, load_scene
+from geofleet.tables.scenes import Drive, Scene, load_drive, pick_scene
 from geofleet.tables.schemas import BBOX, DETECTIONS, GEOMETRY, PASSES, REFERENCE, RUNS, TRUTH
 from geofleet.tables.store import atomic_path, build_table, lonlat, sort_by_key, write_table
 
@@ -347,7 +348,8 @@ def _load_study(signs: Path, drive: Path, config: Config) -> _Study:
         base = resample(road.line, spacing_m=fleet.frame_spacing_m, heading_baseline_m=fleet.heading_baseline_m)
     except InputError as error:
         raise InputError(error.what, where=str(drive), todo=error.todo) from None
-    scene = load_scene(signs, road, **config.scene.model_dump(), cell_m=sensor.range_m)
+    layer = read_layer(signs).table
+    scene = pick_scene(layer, road, source=signs, **config.scene.model_dump(), cell_m=sensor.range_m)
     if len(scene.classes) == 1 and sensor.semantic_rate < 1:
         raise ConfigError(
             f"semantic_rate = {sensor.semantic_rate:g} confuses classes, but the scene has only one: "

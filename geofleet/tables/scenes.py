@@ -73,15 +73,19 @@ def load_drive(path: Path) -> Drive:
     return Drive(names[0], frame, line, t_start)
 
 
-def load_scene(path: Path, drive: Drive, *, corridor_m: float, groups: Sequence[str], cell_m: float) -> Scene:
-    """Read the main signs of some groups near the drive, equal classes at one point counted once.
+def pick_scene(
+    layer: pa.Table, drive: Drive, *, source: Path, corridor_m: float, groups: Sequence[str], cell_m: float
+) -> Scene:
+    """Pick the main signs of some groups near the drive, equal classes at one point counted once.
 
     Parameters
     ----------
-    path
+    layer
         A `signs` table.
     drive
         The drive; the scene is in its frame.
+    source
+        Where the layer came from, for messages.
     corridor_m
         Signs at most this far from the drive are the scene.
     groups
@@ -94,16 +98,16 @@ def load_scene(path: Path, drive: Drive, *, corridor_m: float, groups: Sequence[
     ConfigError
         A group is unknown.
     InputError
-        The table cannot be used, or no sign of it belongs to the scene.
+        No sign of the layer belongs to the scene.
     """
-    layer = _signs_of_groups(path, groups)
+    layer = _signs_of_groups(layer, groups, source)
     lon, lat = lonlat(layer)
     near = within_corridor(lon, lat, drive.frame, drive.line, corridor_m)
     if not near.any():
         raise InputError(
             f"no sign is within {corridor_m:g} m of the drive {drive.drive_id!r}; the nearest of {layer.num_rows} is "
             f"{nearest_m(lon, lat, drive.frame, drive.line):,.0f} m away.",
-            where=str(path),
+            where=str(source),
             todo="Give signs and a drive of the same place, or set corridor_m wider.",
         )
     layer, xy_m = layer.filter(pa.array(near)), drive.frame.to_enu(lon[near], lat[near])
@@ -114,7 +118,7 @@ def load_scene(path: Path, drive: Drive, *, corridor_m: float, groups: Sequence[
     return Scene(layer, field, np.array(layer["sign_id"].to_pylist(), dtype=object), classes)
 
 
-def _signs_of_groups(path: Path, groups: Sequence[str]) -> pa.Table:
+def _signs_of_groups(layer: pa.Table, groups: Sequence[str], source: Path) -> pa.Table:
     taxonomy = load_taxonomy()
     unknown = sorted(set(groups) - set(taxonomy.groups))
     if unknown:
@@ -123,14 +127,14 @@ def _signs_of_groups(path: Path, groups: Sequence[str]) -> pa.Table:
             where="[scene] groups",
             todo=f"Groups are {', '.join(taxonomy.groups)}.",
         )
-    layer = read_table(SIGNS, path, columns=SIGNS.arrow(()).names)
+    layer = layer.select(SIGNS.arrow(()).names)
     is_main = pc.equal(layer["kind"], "main").to_numpy()
     is_wanted = np.isin(taxonomy.group_of(layer["concept"].to_pylist()).astype(str), list(groups))
     found = layer.filter(pa.array(is_main & is_wanted)).sort_by("sign_id")
     if not found.num_rows:
         raise InputError(
             f"none of the {layer.num_rows} signs is a main sign of the groups {', '.join(groups)}.",
-            where=str(path),
+            where=str(source),
             todo="Give another layer, or name other groups in [scene] groups.",
         )
     return found

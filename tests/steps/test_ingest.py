@@ -5,6 +5,7 @@ import json
 import pytest
 
 from geofleet.errors import InputError
+from geofleet.formats import layers
 from geofleet.steps.ingest import ingest_drive, ingest_lanes, ingest_signs, recognise
 from geofleet.tables.manifest import manifest_path
 from geofleet.tables.schemas import DRIVES, LANES, SIGNS
@@ -58,7 +59,7 @@ def test_formats_are_told_by_content(raw, tmp_path):
     odd = tmp_path / "drive.osm"
     odd.write_bytes((raw / "helsinki_derived.pos").read_bytes())
     assert recognise(odd) == "rtklib"
-    assert recognise(raw / "helsinki.osm.pbf") == "osm"
+    assert layers.recognise(raw / "helsinki.osm.pbf") == "osm"
     assert recognise(raw / "NOTICE.md") == ""
 
 
