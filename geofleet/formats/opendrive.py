@@ -76,7 +76,7 @@ def read_signs(
     reader, header = SignalReader(country=country), None
     roads: dict[str, Road] = {}
     poles: dict[str, Place] = {}
-    with explained(path):
+    with explained(path), np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
         for element in header_and_roads(path, _NOT_FOR_SIGNS):
             if element.tag == "header":
                 header = element
@@ -114,7 +114,7 @@ def read_lanes(path: Path, *, crs: str | None = None, origin: tuple[float, float
     """
     lines, header = LaneLines(), None
     roads: dict[str, Road] = {}
-    with explained(path):
+    with explained(path), np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
         for element in header_and_roads(path, _NOT_FOR_LANES):
             if element.tag == "header":
                 header = element

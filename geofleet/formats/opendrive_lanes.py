@@ -34,6 +34,7 @@ NO_LIMIT = "speed limits that are no number"
 _STEP_M = 0.5
 _TOLERANCE_M = 0.005
 _SHORTEST_M = 1e-3
+_FARTHEST_M = 1e9
 _BREAKS = frozenset({"width", "border", "speed"})
 _SIDES = {"left": 1.0, "right": -1.0}
 _KMH = {"km/h": 1.0, "kmh": 1.0, "kph": 1.0, "mph": 1.609344, "m/s": 3.6, "": 3.6}
@@ -54,7 +55,10 @@ class LaneLines:
 
     def add(self, lane_id: str, kind: str, stations: Stations, t: Floats, speed_kmh: float = np.nan) -> None:
         """Add the line at t of some stations of a road."""
-        self.xy_m.append(stations.at(t))
+        xy = stations.at(t)
+        if not (np.abs(xy) < _FARTHEST_M).all():  # infinite and undefined ones too
+            raise InputError(f"the numbers of lane line {lane_id} are too large to give a place.")
+        self.xy_m.append(xy)
         self.lane_id.append(lane_id)
         self.road_id.append(stations.road_id)
         self.kind.append(kind)

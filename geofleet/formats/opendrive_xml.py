@@ -29,7 +29,7 @@ _UNUSED = frozenset({"userData", "include", "dataQuality", "surface", "outline",
 }
 _ORDER = ("a", "b", "c", "d")
 _PARAM_ORDER = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
-_MAX_ROAD_M = 1e6
+_MAX_ROAD_M = 2e5
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +117,8 @@ def _plan_view(road: Element) -> PlanView:
     length = poses[:, 4]
     for record in (records[i] for i in np.flatnonzero((length < 0) | (length > _MAX_ROAD_M))):
         raise InputError(f"length={record.get('length')} is no length of a geometry.", where=place(record))
+    if poses[:, 0].min() < -_MAX_ROAD_M or (poses[:, 0] + length).max() > _MAX_ROAD_M:
+        raise InputError(f"s of the geometry goes beyond {_MAX_ROAD_M / 1000:g} km.", where=place(road))
     order = np.argsort(poses[:, 0], kind="stable")
     order = order[length[order] > 0] if (length > 0).any() else order[:1]
     if not (length > 0).any():

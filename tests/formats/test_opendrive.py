@@ -253,6 +253,7 @@ def test_signals_that_cannot_be_placed_are_counted(path):
         (road(plan=STRAIGHT.replace('length="200"', 'length="-2"')), "length=-2 is no length"),
         (road(plan=STRAIGHT.replace('length="200"', 'length="0"')), "the reference line has no length"),
         (road(plan=STRAIGHT.replace("<line/>", "<spiral curvStart='0'/>")), "curvEnd is missing"),
+        (road(plan=STRAIGHT.replace('s="0"', 's="1e15"')), "s of the geometry goes beyond 200 km"),
         (road(length="long"), 'length="long" is no number'),
         (road(road_id=""), "id is missing"),
         (road() + road(), 'road "7": another road has the same id'),
@@ -270,6 +271,7 @@ def test_lanes_that_cannot_be_read_are_named(path):
     for old, new, message in [
         ('a="3"', 'a="x"', 'line 2: <width>, road "7": a="x" is no number'),
         ('id="-1"', "", "id is missing"),
+        ('a="3"', 'a="1e308"', 'road "7": the numbers of lane line 7/0/1 are too large'),
         ('laneSection s="0"', "laneSection", "<laneSection>.*s is missing"),
         ("<width", "<speed max='3' unit='knots'/><width", 'unit="knots" is unknown'),
     ]:
@@ -586,4 +588,4 @@ def test_reference_lines_agree_with_pyxodr(shared_data):
                 x, y, _ = reference_points(road.plan, np.linspace(0, road.plan.end_m, 4000))
                 line = shapely.linestrings(np.column_stack((x, y)))
                 points = shapely.points(theirs[road.road_id].reference_line[:, :2])
-                assert shapely.distance(line, points).max() < 0.002
+                assert shapely.distance(line, points).max() < 0.003
