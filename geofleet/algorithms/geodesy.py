@@ -73,16 +73,12 @@ class EnuFrame:
         lon, lat = np.asarray(lon_deg, np.float64), np.asarray(lat_deg, np.float64)
         unwrapped = lon[0] + (lon - lon[0] + 180.0) % 360.0 - 180.0
         middle = (unwrapped.min() + unwrapped.max()) / 2
-        return cls(
-            round(float((middle + 180.0) % 360.0 - 180.0), 6), round(float((lat.min() + lat.max()) / 2), 6)
-        )
+        return cls(round(float((middle + 180.0) % 360.0 - 180.0), 6), round(float((lat.min() + lat.max()) / 2), 6))
 
     def to_enu(self, lon_deg: ArrayLike, lat_deg: ArrayLike) -> Floats:
         """Return east and north in metres, shape (n, 2), of points on the ellipsoid."""
         lon, lat = np.asarray(lon_deg, np.float64), np.asarray(lat_deg, np.float64)
-        east, north, _ = _transformer(self.origin_lon_deg, self.origin_lat_deg).transform(
-            lon, lat, np.zeros_like(lon)
-        )
+        east, north, _ = _transformer(self.origin_lon_deg, self.origin_lat_deg).transform(lon, lat, np.zeros_like(lon))
         return np.column_stack((east, north))
 
     def to_lonlat(self, xy_m: Floats) -> tuple[Floats, Floats]:
