@@ -579,13 +579,18 @@ def test_every_record_of_ingolstadt_starts_where_the_one_before_ends(shared_data
 def test_reference_lines_agree_with_pyxodr(shared_data):
     etree = pytest.importorskip("lxml.etree", reason="pyxodr, an oracle, is not installed")
     network = pytest.importorskip("pyxodr.road_objects.road", reason="pyxodr, an oracle, is not installed")
-    for name in ("ingolstadt_cityhall", "a9_nord_excerpt_bssd", "carla_Town01_partial_georef"):
+    # Theirs is interpolated linearly: on tight bends it comes closer to ours with its resolution (71, 4.5, 0.8 mm off in
+    # Ingolstadt at 0.5, 0.2, 0.1 m)
+    named = {"ingolstadt_cityhall": 0.1, "a9_nord_excerpt_bssd": 0.2, "carla_Town01_partial_georef": 0.2}
+    for name, resolution in named.items():
         file = shared_data / "opendrive" / f"{name}.xodr"
-        theirs = {r.get("id"): network.Road(r, resolution=0.2) for r in etree.parse(str(file)).getroot().iter("road")}
+        theirs = {
+            r.get("id"): network.Road(r, resolution=resolution) for r in etree.parse(str(file)).getroot().iter("road")
+        }
         for element in header_and_roads(file, ("lanes", "objects")):
             if element.tag == "road":
                 road = read_road(element)
                 x, y, _ = reference_points(road.plan, np.linspace(0, road.plan.end_m, 4000))
                 line = shapely.linestrings(np.column_stack((x, y)))
                 points = shapely.points(theirs[road.road_id].reference_line[:, :2])
-                assert shapely.distance(line, points).max() < 0.003
+                assert shapely.distance(line, points).max() < 0.001
