@@ -579,7 +579,7 @@ def test_every_record_of_ingolstadt_starts_where_the_one_before_ends(shared_data
 def test_reference_lines_agree_with_pyxodr(shared_data):
     etree = pytest.importorskip("lxml.etree", reason="pyxodr, an oracle, is not installed")
     network = pytest.importorskip("pyxodr.road_objects.road", reason="pyxodr, an oracle, is not installed")
-    # Theirs is interpolated linearly: on tight bends it comes closer to ours with its resolution (71, 4.5, 0.8 mm off in
+    # Theirs is interpolated linearly: on tight bends it nears ours with its resolution (71, 4.5, 0.8 mm off in
     # Ingolstadt at 0.5, 0.2, 0.1 m)
     named = {"ingolstadt_cityhall": 0.1, "a9_nord_excerpt_bssd": 0.2, "carla_Town01_partial_georef": 0.2}
     for name, resolution in named.items():
