@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geofleet.errors import GeofleetError, InputError
+from geofleet.errors import ConfigError, GeofleetError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -35,6 +35,19 @@ app.add_typer(ingest_app, name="ingest")
 
 Inputs = Annotated[list[Path], typer.Argument(help="Files to read.", show_default=False)]
 Out = Annotated[Path, typer.Option("--out", help="Table to write.")]
+FileFormat = Annotated[str, typer.Option("--format", help="auto, or the name of the format of all inputs.")]
+Crs = Annotated[str | None, typer.Option("--crs", help="CRS of the coordinates, e.g. EPSG:25832.")]
+Origin = Annotated[str | None, typer.Option("--origin", help="Where local coordinates are zero.", metavar="LAT,LON")]
+Utm = Annotated[
+    str | None,
+    typer.Option("--utm", help="Projected CRS of local coordinates, and where they are zero.", metavar="CRS,E0,N0"),
+]
+Columns = Annotated[
+    str | None,
+    typer.Option(
+        "--columns", help="What columns mean: code=bord,facing=azimuth, or a TOML file.", metavar="NAME=COLUMN,..."
+    ),
+]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="A TOML file of settings.")]
 Scenario = Annotated[str, typer.Option("--scenario", help="Name of a packaged scenario, or a TOML file.")]
@@ -65,31 +78,55 @@ def _fail(message: str) -> None:
 def ingest_signs(
     inputs: Inputs,
     out: Out,
-    file_format: Annotated[str, typer.Option("--format", help="auto or osm.")] = "auto",
+    file_format: FileFormat = "auto",
+    crs: Crs = None,
+    origin: Origin = None,
+    utm: Utm = None,
+    columns: Columns = None,
+    scheme: Annotated[str | None, typer.Option(help="Scheme of the codes: mapillary, osm, vienna, us ...")] = None,
+    country: Annotated[str | None, typer.Option(help="ISO 3166-1 alpha-2 of codes that do not name it.")] = None,
     roads: Annotated[bool, typer.Option("--roads/--no-roads", help="Infer facing and road from the ways.")] = True,
     as_json: AsJson = False,
 ) -> None:
-    """Read signs from maps into a `signs` table.
+    """Read signs from maps and inventories into a `signs` table.
 
     Example: geofleet ingest signs data/raw/helsinki.osm.pbf --out signs.parquet
     """
     from geofleet.steps import ingest
 
+    options = {"crs": crs, "origin": _origin(origin), "utm": _utm(utm), "scheme": scheme, "country": country}
     with _progress("reading signs") as progress:
-        result = ingest.ingest_signs(inputs, out, file_format=file_format, roads=roads, progress=progress)
+        result = ingest.ingest_signs(
+            inputs,
+            out,
+            file_format=file_format,
+            roads=roads,
+            progress=progress,
+            columns=_columns(columns),
+            **options,
+        )
     _report(result, as_json=as_json)
 
 
 @ingest_app.command("lanes")
-def ingest_lanes(inputs: Inputs, out: Out, as_json: AsJson = False) -> None:
+def ingest_lanes(
+    inputs: Inputs,
+    out: Out,
+    file_format: FileFormat = "auto",
+    crs: Crs = None,
+    origin: Origin = None,
+    utm: Utm = None,
+    as_json: AsJson = False,
+) -> None:
     """Read drivable roads or lanes into a `lanes` table.
 
     Example: geofleet ingest lanes data/raw/helsinki.osm.pbf --out lanes.parquet
     """
     from geofleet.steps import ingest
 
+    options = {"crs": crs, "origin": _origin(origin), "utm": _utm(utm)}
     with _progress("reading roads") as progress:
-        result = ingest.ingest_lanes(inputs, out, progress=progress)
+        result = ingest.ingest_lanes(inputs, out, file_format=file_format, progress=progress, **options)
     _report(result, as_json=as_json)
 
 
@@ -296,6 +333,8 @@ def schema(
     from geofleet.tables.schemas import SCHEMAS
     from geofleet.tables.store import schema_named
 
+    names: tuple[str, ...]
+    rows: list[tuple[str, ...]]
     if table is None:
         rows = [(s.name, ", ".join(s.key), s.description) for s in SCHEMAS.values()]
         names = ("table", "key", "description")
@@ -309,6 +348,45 @@ def schema(
         _print_json([dict(zip(names, row, strict=True)) for row in rows])
     else:
         _print_table(names, rows)
+
+
+def _origin(text: str | None) -> tuple[float, float] | None:
+    """Read `LAT,LON`."""
+    if text is None:
+        return None
+    try:
+        lat, lon = map(float, text.split(","))
+    except ValueError:
+        raise ConfigError(f"{text!r} is not LAT,LON.", where="--origin", todo="Example: --origin 49.0,8.4") from None
+    return lat, lon
+
+
+def _utm(text: str | None) -> tuple[str, float, float] | None:
+    """Read `CRS,E0,N0`."""
+    if text is None:
+        return None
+    crs, *zero = text.split(",")
+    try:
+        east, north = map(float, zero)
+    except ValueError:
+        raise ConfigError(
+            f"{text!r} is not CRS,E0,N0.", where="--utm", todo="Example: --utm EPSG:32633,450000,5400000"
+        ) from None
+    return crs, east, north
+
+
+def _columns(text: str | None) -> dict[str, str] | Path | None:
+    """Read `name=column,name=column`, or the path of a TOML file."""
+    if text is None:
+        return None
+    if text.endswith(".toml"):
+        return Path(text)
+    pairs = [pair.partition("=") for pair in text.split(",")]
+    if not all(name and column for name, _, column in pairs):
+        raise ConfigError(
+            f"{text!r} is not name=column,...", where="--columns", todo="Example: --columns code=bord,facing=azimuth"
+        )
+    return {name.strip(): column.strip() for name, _, column in pairs}
 
 
 def _settle(scenario: str | Path, settings: list[str] | None, **options: Any) -> Config:
@@ -352,7 +430,11 @@ def _report(result: Any, *, as_json: bool) -> None:
 
 
 def _print_json(value: Any) -> None:
-    typer.echo(json.dumps(value, indent=2, default=lambda v: asdict(v) if is_dataclass(v) else str(v)))
+    typer.echo(json.dumps(value, indent=2, default=_plain))
+
+
+def _plain(value: Any) -> Any:
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
 
 
 def _print_scores(totals: tuple[dict[str, Any], ...]) -> None:
