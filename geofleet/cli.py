@@ -341,9 +341,9 @@ def schema(
     else:
         found = schema_named(table)
         names = ("column", "type", "null", "description")
-        rows = [(c.name, str(c.type), "null" if c.nullable else "", c.description) for c in found.all_columns] + [
-            ("geometry", f"{found.geometry}, WKB", "", "OGC:CRS84, longitude and latitude")
-        ] * bool(found.geometry)
+        rows = [(c.name, str(c.type), "null" if c.nullable else "", c.description) for c in found.all_columns]
+        if found.geometry:
+            rows.append(("geometry", f"{found.geometry}, WKB", "", "OGC:CRS84, longitude and latitude"))
     if as_json:
         _print_json([dict(zip(names, row, strict=True)) for row in rows])
     else:
