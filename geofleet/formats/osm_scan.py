@@ -1,84 +1,183 @@
-"""One pass over an OpenStreetMap file at a time, through pyosmium: sign-like nodes, drivable ways, nodes by id.
+"""What is looked for in an OpenStreetMap file: nodes that carry signs, and drivable ways with their nodes.
 
-Filters run in C++, so Python sees what is kept and little else; memory grows with that and not with the file.
+Files are PBF, or are made into one first, by libosmium, in a temporary folder: then one reader serves all.
 """
 
 from __future__ import annotations
 
 import re
+import tempfile
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import groupby
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import osmium
-from osmium.osm import NODE, WAY
 
 from geofleet.errors import InputError
+from geofleet.formats import osm_json
+from geofleet.formats.osm_pbf import Block, DenseNodes, UnusualPbfError, deltas, read_blocks, varints
 from geofleet.formats.osm_roads import Roads
-from geofleet.formats.osm_tags import POINT_HIGHWAYS, SIGN_KEYS, is_drivable, is_sign_key, oneway_of, speed_kmh
+from geofleet.formats.osm_tags import (
+    KEY_STARTS,
+    POINT_HIGHWAYS,
+    is_drivable,
+    is_sign_key,
+    oneway_of,
+    speed_kmh,
+    tells_of_signs,
+)
 from geofleet.formats.reading import BZIP2, GZIP, read_head
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from numpy.typing import NDArray
+
+    Ints = NDArray[np.int64]
+    Tagset = tuple[tuple[str, str], ...]
 
 _PBF_MARK = b"OSMHeader"
 _MARK_WITHIN = 1024
 _LANELET = re.compile(rb"""v=["']lanelet["']""")
 _CHUNK, _OVERLAP = 1 << 20, 64
+_E7 = 1e7
+_MAX_E7 = (1_800_000_000, 900_000_000)
+_HIGHWAY = b"\n\x07highway"
+# What a block with signs has in its string table: a key, or a word of `highway` with its length before it.
+_MARKS = (b"traffic_sign", *(b"\n%c" % len(word) + word.encode() for word in POINT_HIGHWAYS))
+_KEY_STARTS = tuple(start.encode() for start in KEY_STARTS)
+_WORDS = frozenset(word.encode() for word in POINT_HIGHWAYS)
 
 
 @dataclass(frozen=True, slots=True)
 class SignNodes:
-    """Nodes that carry signs: id, longitude and latitude in degrees (NaN when invalid), tags; all of length n."""
+    """Nodes that carry signs, in the order of the file.
 
-    node_id: NDArray[np.int64]
-    lon: NDArray[np.float64]
-    lat: NDArray[np.float64]
-    tags: list[dict[str, str]]
+    Parameters
+    ----------
+    node_id
+        Shape (n,).
+    lon_e7, lat_e7
+        Position in 1e-7 degrees, as the file has it, shape (n,).
+    tagset
+        Index into `tagsets`, shape (n,).
+    tagsets
+        The different tags that such nodes have, those that tell of signs only.
+    """
+
+    node_id: Ints
+    lon_e7: NDArray[np.int32]
+    lat_e7: NDArray[np.int32]
+    tagset: NDArray[np.int32]
+    tagsets: list[dict[str, str]]
+
+    @property
+    def is_valid(self) -> NDArray[np.bool_]:
+        """Which positions lie on Earth."""
+        lon, lat = np.abs(self.lon_e7.astype(np.int64)), np.abs(self.lat_e7.astype(np.int64))
+        return np.asarray((lon <= _MAX_E7[0]) & (lat <= _MAX_E7[1]), bool)
+
+    @property
+    def lon(self) -> NDArray[np.float64]:
+        """Longitude in degrees, shape (n,)."""
+        return self.lon_e7 / _E7
+
+    @property
+    def lat(self) -> NDArray[np.float64]:
+        """Latitude in degrees, shape (n,)."""
+        return self.lat_e7 / _E7
+
+    def take(self, rows: NDArray[Any]) -> SignNodes:
+        """Return some of the nodes."""
+        return SignNodes(self.node_id[rows], self.lon_e7[rows], self.lat_e7[rows], self.tagset[rows], self.tagsets)
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """Sign nodes of a block: as `SignNodes`, with tag sets of its own; `has_nodes` whether there was any node."""
+
+    has_nodes: bool
+    groups: list[tuple[Ints, Ints, Ints, list[int]]]
+    tagsets: list[Tagset]
 
 
 def detect(head: bytes) -> str:
-    """Return pyosmium's name of the format that a file's first bytes show, or "" when it is not OpenStreetMap's."""
+    """Return the encoding that a file's first bytes show, or "" when it is not OpenStreetMap's.
+
+    `pbf`, `osm` (XML) or `json` (Overpass), the latter two with `.gz` or `.bz2` when packed.
+    """
     if _PBF_MARK in head[:32]:
         return "pbf"
-    if head.startswith(GZIP):
-        return "osm.gz"
-    if head.startswith(BZIP2):
-        return "osm.bz2"
+    for mark, suffix, unpacked in ((GZIP, ".gz", osm_json.gunzipped), (BZIP2, ".bz2", osm_json.bunzipped)):
+        if head.startswith(mark):
+            inside = unpacked(head)
+            # A block of bzip2 shows nothing before its end, and what is packed and cannot be seen is a map.
+            return f"{'json' if osm_json.looks_like(inside) else 'osm'}{suffix}"
+    if osm_json.looks_like(head):
+        return "json"
     return "osm" if b"<osm" in head[:_MARK_WITHIN] else ""
 
 
-def open_osm(path: Path) -> osmium.io.File:
-    """Open a file by its content; its name does not matter.
+@contextmanager
+def as_pbf(path: Path) -> Iterator[Path]:
+    """Yield a file as PBF: itself, or a copy in a temporary folder.
 
     Raises
     ------
     InputError
-        The file is missing, empty or not OpenStreetMap's.
+        The file is missing, empty, damaged or not OpenStreetMap's.
     """
     found = detect(read_head(path))
     if not found:
         raise InputError(
             "not an OpenStreetMap file.",
             where=str(path),
-            todo="Give a .osm.pbf, .osm, .osm.gz or .osm.bz2 file.",
+            todo="Give a .osm.pbf, .osm or Overpass .json file; the latter two may be packed (.gz, .bz2).",
         )
-    return osmium.io.File(str(path), found)
+    if found == "pbf" and _is_usual(path):
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="geofleet-") as folder:
+        copy = Path(folder) / "map.osm.pbf"
+        with explained(path):
+            _rewrite(path, found, copy)
+        with explained(path):
+            yield copy
+
+
+def _is_usual(path: Path) -> bool:
+    """Tell whether a PBF can be read as it is, by its header and first block."""
+    try:
+        next(read_blocks(path, lambda block: [None for _ in block.dense_nodes(tagged=False)]), None)
+    except UnusualPbfError:
+        return False
+    return True
+
+
+def _rewrite(path: Path, found: str, copy: Path) -> None:
+    import osmium  # noqa: PLC0415  (libosmium is not needed for PBF)
+
+    if found == "osm.bz2" and osm_json.looks_like(osm_json.bz2_head(path)):
+        found = "json.bz2"
+    with osmium.SimpleWriter(str(copy)) as writer:
+        if found.startswith("json"):
+            osm_json.write_elements(path, writer)
+        else:
+            try:
+                osmium.apply(osmium.io.File(str(path), found), writer)
+            except osmium.InvalidLocationError as error:
+                raise ValueError(*error.args) from None
 
 
 @contextmanager
 def explained(path: Path) -> Iterator[None]:
-    """Turn what pyosmium raises on a damaged file into an InputError."""
+    """Turn what readers raise on a damaged file into an InputError that names the file asked for."""
     try:
         yield
     except InputError as error:
         raise InputError(error.what, where=str(path), todo=error.todo) from None
-    except (osmium.InvalidLocationError, RuntimeError, ValueError, OSError, OverflowError, MemoryError) as error:
+    except (RuntimeError, ValueError, OSError, EOFError, OverflowError, MemoryError) as error:
         reason = str(error).strip().rstrip(".") or type(error).__name__
         raise InputError(
             f"damaged, or not an OpenStreetMap file ({reason}).",
@@ -107,64 +206,194 @@ def refuse_lanelet2(path: Path) -> None:
             tail = chunk[-_OVERLAP:]
 
 
-def sign_nodes(file: osmium.io.File) -> SignNodes:
+def sign_nodes(pbf: Path) -> SignNodes:
     """Read every node with a `traffic_sign` key or a `highway` value that stands for a sign or light.
 
     Raises
     ------
     InputError
-        The file holds no node at all.
+        The file is damaged or holds no node at all.
     """
-    if next(iter(osmium.FileProcessor(file, NODE)), None) is None:
-        raise InputError("the file holds no nodes.", todo="Check that it is the extract you mean.")
-    stream: Any = osmium.FileProcessor(file, NODE).with_filter(osmium.filter.KeyFilter(*SIGN_KEYS, "highway"))
-    found = []
-    for node in stream:
-        tags = dict(node.tags)
-        if node.deleted or not (tags.get("highway") in POINT_HIGHWAYS or any(map(is_sign_key, tags))):
+    tagsets: dict[Tagset, int] = {}
+    columns: list[tuple[Ints, NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]] = []
+    has_nodes = False
+    for found in read_blocks(pbf, _signs_in):
+        has_nodes |= found.has_nodes
+        number = np.array([tagsets.setdefault(tags, len(tagsets)) for tags in found.tagsets], np.int32)
+        for node_id, lon, lat, own in found.groups:
+            columns.append((node_id, _int32(lon), _int32(lat), number[own]))
+    if not has_nodes:
+        raise InputError("the file holds no nodes.", where=str(pbf), todo="Check that it is the extract you mean.")
+    empty = (np.zeros(0, np.int64), *(np.zeros(0, np.int32) for _ in range(3)))
+    node_id, lon32, lat32, tagset = (np.concatenate(column) for column in zip(empty, *columns, strict=True))
+    return SignNodes(node_id, lon32, lat32, tagset, [dict(tags) for tags in tagsets])
+
+
+def _int32(e7: Ints) -> NDArray[np.int32]:
+    """Return positions in half the room; what does not fit is nowhere on Earth and stays so."""
+    limit = np.iinfo(np.int32).max
+    return np.clip(e7, -limit, limit).astype(np.int32)
+
+
+def _signs_in(block: Block) -> _Found:
+    """Return the sign nodes of a block."""
+    if not any(map(block.holds_string, _MARKS)):
+        return _Found(block.has_nodes(), [], [])
+    strings = block.strings
+    key_role, is_word, highway = _roles(strings)
+    tagsets: dict[bytes, int] = {}
+    groups = []
+    has_nodes = False
+    for nodes in block.dense_nodes():
+        has_nodes |= len(nodes.node_id) > 0
+        if not len(nodes.keys_vals):
             continue
-        place = (node.location.lon, node.location.lat) if node.location.valid() else (np.nan, np.nan)
-        found.append((node.id, *place, tags))
-    return SignNodes(
-        np.array([row[0] for row in found], np.int64),
-        np.array([row[1] for row in found], np.float64),
-        np.array([row[2] for row in found], np.float64),
-        [row[3] for row in found],
-    )
+        chosen, counts, pairs = _sign_tags(nodes, key_role, is_word, highway)
+        packed = pairs.tobytes()
+        ends = (16 * np.cumsum(counts)).tolist()
+        own = [tagsets.setdefault(packed[a:b], len(tagsets)) for a, b in zip([0, *ends], ends, strict=False)]
+        groups.append((nodes.node_id[chosen], nodes.lon_e7[chosen], nodes.lat_e7[chosen], own))
+    return _Found(has_nodes, groups, [_tags(packed, strings) for packed in tagsets])
 
 
-def read_roads(file: osmium.io.File) -> Roads:
-    """Read the drivable ways: one pass for the ways, one for the nodes that they refer to."""
-    ways: list[tuple[int, list[int], dict[str, str]]] = []
-    stream: Any = osmium.FileProcessor(file, WAY).with_filter(osmium.filter.KeyFilter("highway"))
-    for way in stream:
-        tags = dict(way.tags)
-        if is_drivable(tags) and not way.deleted:
-            ways.append((way.id, [node.ref for node in way.nodes], tags))
-    place = _locations(file, {ref for _, refs, _ in ways for ref in refs})
-    n_missing = 0
-    runs: list[tuple[int, int, list[int], dict[str, str]]] = []
-    for way_id, refs, tags in ways:
-        n_missing += sum(ref not in place for ref in refs)
-        pieces = [list(run) for there, run in groupby(refs, place.__contains__) if there]
-        runs += [(way_id, part, run, tags) for part, run in enumerate(p for p in pieces if len(p) > 1)]
-    points = np.array([place[ref] for _, _, run, _ in runs for ref in run], np.float64).reshape(-1, 2)
+def _roles(strings: list[bytes]) -> tuple[NDArray[np.int8], NDArray[np.bool_], int]:
+    """Tell which strings are keys that tell of signs (1) or name them (2), which are signs' words, which is highway."""
+    role = np.zeros(len(strings), np.int8)
+    is_word = np.zeros(len(strings), bool)
+    highway = -1
+    for index, text in enumerate(strings):
+        if text.startswith(_KEY_STARTS):
+            key = text.decode(errors="replace")
+            role[index] = 2 if is_sign_key(key) else tells_of_signs(key)
+            if text == b"highway":
+                highway = index
+        if text in _WORDS:
+            is_word[index] = True
+    return role, is_word, highway
+
+
+def _sign_tags(
+    nodes: DenseNodes, key_role: NDArray[np.int8], is_word: NDArray[np.bool_], highway: int
+) -> tuple[Ints, Ints, Ints]:
+    """Return which nodes carry signs, how many tags of theirs tell of them, and those: numbers of strings, (m, 2)."""
+    coded = nodes.keys_vals
+    is_end = coded == 0
+    node_of = np.cumsum(is_end) - is_end
+    ends = np.flatnonzero(is_end)
+    if len(ends) != len(nodes.node_id) or ends[-1] != len(coded) - 1:
+        raise ValueError("tags and nodes differ in number")
+    start = np.concatenate(([0], ends[:-1] + 1))
+    is_key = ~is_end & ((np.arange(len(coded)) - start[node_of]) % 2 == 0)
+    at = np.flatnonzero(is_key & (key_role[coded] > 0))
+    key, value, owner = coded[at], coded[at + 1], node_of[at]
+    names = (key_role[key] == 2) | ((key == highway) & is_word[value])  # noqa: PLR2004 - the role of sign keys
+    carries = np.zeros(len(nodes.node_id), bool)
+    carries[owner[names]] = True
+    kept = carries[owner]
+    chosen = np.flatnonzero(carries)
+    counts = np.bincount(owner[kept], minlength=len(carries))[chosen]
+    return chosen, counts, np.column_stack((key[kept], value[kept]))
+
+
+def _tags(packed: bytes, strings: list[bytes]) -> Tagset:
+    pairs = np.frombuffer(packed, np.int64).reshape(-1, 2).tolist()
+    text = [(strings[key].decode(errors="replace"), strings[value].decode(errors="replace")) for key, value in pairs]
+    return tuple(sorted(text))
+
+
+def read_roads(pbf: Path) -> Roads:
+    """Read the drivable ways: one pass for the ways, one for the nodes that they refer to.
+
+    Raises
+    ------
+    InputError
+        The file is damaged.
+    """
+    ways = [way for found in read_blocks(pbf, _ways_in) for way in found]
+    refs = np.concatenate([np.zeros(0, np.int64), *(way.refs for way in ways)])
+    way_of = np.repeat(np.arange(len(ways)), [len(way.refs) for way in ways])
+    wanted = np.unique(refs)
+    place = np.full((len(wanted), 2), np.iinfo(np.int64).max)
+    for found in read_blocks(pbf, lambda block: _nodes_in(block, wanted)):
+        for index, lon, lat in found:
+            place[index, 0], place[index, 1] = lon, lat
+    there = (np.abs(place) <= _MAX_E7).all(axis=1)
+    index = np.searchsorted(wanted, refs)
+    is_there = there[index]
+    way_of, index = way_of[is_there], index[is_there]
+    kept, first, sizes = _runs(np.flatnonzero(is_there), way_of)
+    run_way = way_of[first]
+    points = place[index[kept]] / _E7
+    new = np.flatnonzero(np.diff(run_way, prepend=-1))
     return Roads(
-        way_id=np.array([way_id for way_id, *_ in runs], np.int64),
-        part=np.array([part for _, part, *_ in runs], np.int64),
-        oneway=np.array([oneway_of(tags) for *_, tags in runs], np.int8),
-        kind=np.array([tags["highway"] for *_, tags in runs], object),
-        speed_limit_kmh=np.array([speed_kmh(tags.get("maxspeed")) for *_, tags in runs], np.float64),
-        start=np.cumsum([0, *(len(run) for _, _, run, _ in runs)], dtype=np.int64),
+        way_id=np.array([ways[way].way_id for way in run_way], np.int64),
+        part=np.arange(len(run_way)) - np.repeat(new, np.diff(new, append=len(run_way))),
+        oneway=np.array([ways[way].oneway for way in run_way], np.int8),
+        kind=np.array([ways[way].kind for way in run_way], object),
+        speed_limit_kmh=np.array([ways[way].speed_limit_kmh for way in run_way], np.float64),
+        start=np.concatenate(([0], np.cumsum(sizes))),
         lon=points[:, 0],
         lat=points[:, 1],
-        n_missing_nodes=n_missing,
+        n_missing_nodes=int((~is_there).sum()),
     )
 
 
-def _locations(file: osmium.io.File, wanted: set[int]) -> dict[int, tuple[float, float]]:
-    """Return longitude and latitude of the nodes wanted that the file holds."""
-    # pyosmium's IdFilter would be faster, but its bit set takes 400 MB for the ids of today whatever their number.
-    nodes: Any = osmium.FileProcessor(file, NODE)
-    found = ((node.id, node.location) for node in nodes if node.id in wanted)
-    return {number: (place.lon, place.lat) for number, place in found if place.valid()}
+def _runs(position: Ints, way_of: Ints) -> tuple[NDArray[np.bool_], Ints, Ints]:
+    """Find runs of two and more points that follow each other within a way.
+
+    Returns which points belong to one, the first point of each and its size.
+    """
+    breaks = (np.diff(position, prepend=-2) != 1) | (np.diff(way_of, prepend=-1) != 0)
+    first = np.flatnonzero(breaks)
+    sizes = np.diff(first, append=len(position))
+    is_long = sizes > 1
+    return np.repeat(is_long, sizes), first[is_long], sizes[is_long]
+
+
+@dataclass(frozen=True, slots=True)
+class _Way:
+    way_id: int
+    refs: Ints
+    kind: str
+    oneway: int
+    speed_limit_kmh: float
+
+
+def _ways_in(block: Block) -> list[_Way]:
+    """Return the drivable ways of a block."""
+    if not block.holds_string(_HIGHWAY):
+        return []
+    strings = block.strings
+    mark = _encoded(strings.index(b"highway")) if b"highway" in strings else None
+    if mark is None:
+        return []
+    found = []
+    for way_id, keys, values, refs in block.ways(lambda packed: mark in packed):
+        pairs = zip(varints(keys).tolist(), varints(values).tolist(), strict=True)
+        tags = {strings[key].decode(errors="replace"): strings[value].decode(errors="replace") for key, value in pairs}
+        if is_drivable(tags):
+            speed = speed_kmh(tags.get("maxspeed"))
+            found.append(
+                _Way(way_id, deltas(refs), tags["highway"], oneway_of(tags), np.nan if speed is None else speed)
+            )
+    return found
+
+
+def _nodes_in(block: Block, wanted: Ints) -> list[tuple[Ints, Ints, Ints]]:
+    """Return index among the wanted ids, longitude and latitude of the nodes of a block that are wanted."""
+    found = []
+    for nodes in block.dense_nodes(tagged=False):
+        index = np.searchsorted(wanted, nodes.node_id)
+        hit = np.flatnonzero(wanted[np.minimum(index, len(wanted) - 1)] == nodes.node_id) if len(wanted) else index[:0]
+        found.append((index[hit], nodes.lon_e7[hit], nodes.lat_e7[hit]))
+    return found
+
+
+def _encoded(number: int) -> bytes:
+    """Return a number as PBF packs it."""
+    packed = bytearray()
+    while number > 0x7F:  # noqa: PLR2004 - seven bits a byte
+        packed.append(number & 0x7F | 0x80)
+        number >>= 7
+    packed.append(number)
+    return bytes(packed)

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     from geofleet.taxonomy import Meaning
 
 POINT_HIGHWAYS = {"stop": "stop", "give_way": "give_way", "traffic_signals": "traffic_signals"}
-_SLOTS = ("", *(f":{n}" for n in range(1, 13)))
-_SIDES = ("", ":forward", ":backward", ":both")
-SIGN_KEYS = tuple(f"traffic_sign{slot}{side}" for slot in _SLOTS for side in _SIDES)
+_PLAIN_KEYS = frozenset({"highway", "direction", "city_limit", "traffic_signals:direction"})
+KEY_STARTS = ("traffic_sign", "max", *_PLAIN_KEYS)
 _SIGN_KEY = re.compile(r"traffic_sign(?::(?P<slot>\d+))?(?::(?P<side>forward|backward|both))?")
 _COUNTRY = re.compile(r"(?:([A-Za-z]{2}):\s*(?=\S))?(.*)", re.DOTALL)
 _NUMBER = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*°?\s*")
@@ -139,6 +138,11 @@ def split_outside_brackets(text: str, separator: str) -> list[str]:
 def is_sign_key(key: str) -> bool:
     """Tell whether a key names signs; `traffic_sign:note` and `traffic_signals` do not."""
     return _SIGN_KEY.fullmatch(key) is not None
+
+
+def tells_of_signs(key: str) -> bool:
+    """Tell whether a tag can change what the signs of a node are, or where they face."""
+    return key in _PLAIN_KEYS or key.startswith(("traffic_sign:", "max"))
 
 
 def tagged_signs(tags: Mapping[str, str]) -> list[TaggedSign]:

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 from geofleet.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     import pyarrow as pa
 
 GZIP, BZIP2 = b"\x1f\x8b", b"BZh"
 _HEAD_BYTES = 4096
+MAX_LINE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +40,24 @@ class LayerRead:
     found: dict[str, int] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class LayerStream:
+    """A table read from one file, in pieces that need not be held together.
+
+    Parameters
+    ----------
+    pieces
+        Tables in the schema asked for, each sorted by key and all of it before the next.
+    file_format, skipped, found
+        As `LayerRead`.
+    """
+
+    pieces: Iterator[pa.Table]
+    file_format: str
+    skipped: dict[str, int] = field(default_factory=dict)
+    found: dict[str, int] = field(default_factory=dict)
+
+
 def read_head(path: Path) -> bytes:
     """Return the first bytes of a file.
 
@@ -57,3 +77,27 @@ def read_head(path: Path) -> bytes:
     if not head:
         raise InputError("the file is empty.", where=str(path), todo="Fetch or export it again.")
     return head
+
+
+def refuse_long_lines(path: Path, *, max_bytes: int = MAX_LINE_BYTES) -> None:
+    """Look through a text file, a piece at a time, for a line that no such file has.
+
+    Raises
+    ------
+    InputError
+        A line is longer than `max_bytes`. The message names it.
+    """
+    n_open = n_lines = 0
+    with path.open("rb") as file:
+        while chunk := file.read(max_bytes):
+            cut = chunk.find(b"\n")
+            n_open += len(chunk) if cut < 0 else cut
+            if n_open > max_bytes:
+                raise InputError(
+                    f"the line is longer than {max_bytes >> 10} KiB.",
+                    where=f"{path}: line {n_lines + 1}",
+                    todo="This is no text file of epochs or rows: fetch or export it again.",
+                )
+            if cut >= 0:
+                n_lines += chunk.count(b"\n")
+                n_open = len(chunk) - chunk.rfind(b"\n") - 1

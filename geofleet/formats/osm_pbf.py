@@ -1,0 +1,342 @@
+"""OpenStreetMap's PBF, read a block at a time: https://wiki.openstreetmap.org/wiki/PBF_Format.
+
+Blocks are unpacked on two threads and decoded as arrays, numbers of a block at once. Blocks that cannot hold what is
+looked for are passed over by a search in their string table, so that a file is read about as fast as it unpacks, and
+memory holds a few blocks whatever its size.
+
+Read are dense nodes and ways in raw or zlib blobs, which is what every usual writer makes. Anything else that the
+format allows raises `UnusualPbfError`; libosmium can rewrite such a file.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from geofleet.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from concurrent.futures import Future
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from numpy.typing import NDArray
+
+    Ints = NDArray[np.int64]
+
+__all__ = ["Block", "DenseNodes", "UnusualPbfError", "deltas", "read_blocks", "varints"]
+
+_MAX_HEADER_BYTES = 64 * 1024
+_MAX_BLOB_BYTES = 32 * 1024 * 1024
+_MAX_VARINT_BYTES = 10
+_READ = frozenset({"OsmSchema-V0.6", "DenseNodes"})
+_THREADS, _AHEAD = 2, 4
+_NANO_PER_E7 = 100
+_VARINT, _BYTES = 0, 2
+_FIXED_BYTES = {1: 8, 5: 4}
+
+_T = TypeVar("_T")
+Span = tuple[int, int]
+
+
+class UnusualPbfError(Exception):
+    """A valid file that uses a rare part of the format: another compression, nodes that are not dense, history."""
+
+
+class DamagedPbfError(ValueError):
+    """The bytes are not what the format allows; `read_blocks` tells where."""
+
+
+@dataclass(frozen=True, slots=True)
+class DenseNodes:
+    """Nodes of a group: ids and positions in 1e-7 degrees, shape (n,), and their tags as the block has them.
+
+    `keys_vals` holds numbers of strings, key and value in turn, with a 0 after each node; empty when no node has tags.
+    """
+
+    node_id: Ints
+    lon_e7: Ints
+    lat_e7: Ints
+    keys_vals: Ints
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of a file, unpacked and not yet decoded."""
+
+    data: bytes
+
+    @cached_property
+    def _parts(self) -> tuple[Span, list[Span], dict[int, int]]:
+        """Return where the string table and the groups lie, and the numbers by field."""
+        strings, groups, numbers = (0, 0), [], {17: 100, 19: 0, 20: 0}
+        for number, value in _fields(self.data, (0, len(self.data))):
+            if number == 1 and isinstance(value, tuple):
+                strings = value
+            elif number == 2 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's
+                groups.append(value)
+            elif isinstance(value, int):
+                numbers[number] = _signed(value)
+        return strings, groups, numbers
+
+    def holds_string(self, text: bytes) -> bool:
+        """Tell whether a string of the block starts with a text; may say yes when none does, never no wrongly."""
+        start, end = self._parts[0]
+        return self.data.find(text, start, end) >= 0
+
+    @property
+    def strings(self) -> list[bytes]:
+        """The string table."""
+        return strings_of(self.data, self._parts[0])
+
+    def dense_nodes(self, *, tagged: bool = True) -> Iterator[DenseNodes]:
+        """Yield the nodes of each group; without tags when they are not asked for.
+
+        Raises
+        ------
+        UnusualPbfError
+            Nodes are not stored densely.
+        """
+        _, groups, numbers = self._parts
+        for group in groups:
+            for number, value in _fields(self.data, group):
+                if number == 1:
+                    raise UnusualPbfError("nodes that are not dense")
+                if number == 2 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's
+                    yield self._dense(value, numbers, tagged=tagged)
+
+    def has_nodes(self) -> bool:
+        """Tell whether the block holds nodes, without decoding them."""
+        return any(number in {1, 2} for group in self._parts[1] for number, _ in _fields(self.data, group))
+
+    def ways(self, is_wanted: Callable[[bytes], bool]) -> Iterator[tuple[int, bytes, bytes, bytes]]:
+        """Yield id, packed keys, packed values and packed references of the ways whose packed keys are wanted."""
+        for group in self._parts[1]:
+            for number, value in _fields(self.data, group):
+                if number != 3:  # noqa: PLR2004 - field numbers are the format's
+                    break
+                if isinstance(value, tuple):
+                    way = self._way(value)
+                    if is_wanted(way[1]):
+                        yield way
+
+    def _way(self, span: Span) -> tuple[int, bytes, bytes, bytes]:
+        way_id = 0
+        packed = {2: b"", 3: b"", 8: b""}
+        for number, value in _fields(self.data, span):
+            if isinstance(value, tuple):
+                packed[number] = self.data[slice(*value)]
+            elif number == 1:
+                way_id = _signed(value)
+        return way_id, packed[2], packed[3], packed[8]
+
+    def _dense(self, span: Span, numbers: dict[int, int], *, tagged: bool) -> DenseNodes:
+        packed = {1: b"", 8: b"", 9: b"", 10: b""}
+        for number, value in _fields(self.data, span):
+            if isinstance(value, tuple):
+                packed[number] = self.data[slice(*value)]
+        node_id, lat, lon = (deltas(packed[number]) for number in (1, 8, 9))
+        if not len(node_id) == len(lat) == len(lon):
+            raise DamagedPbfError("ids and positions differ in number")
+        lat_e7, lon_e7 = (_e7(numbers[offset] + numbers[17] * side) for offset, side in ((19, lat), (20, lon)))
+        return DenseNodes(node_id, lon_e7, lat_e7, varints(packed[10]) if tagged else np.zeros(0, np.int64))
+
+
+def strings_of(data: bytes, span: Span) -> list[bytes]:
+    """Return the strings of a string table, in order."""
+    found = []
+    at, end = span
+    while at < end:
+        if data[at] != 0x0A:  # noqa: PLR2004 - field 1, bytes
+            raise DamagedPbfError("a string table with something else in it")
+        size = data[at + 1]
+        at += 2
+        if size >= 0x80:  # noqa: PLR2004 - more bytes follow
+            size, at = _varint(data, at - 1)
+        found.append(data[at : at + size])
+        at += size
+    if at != end:
+        raise DamagedPbfError("a string table beyond its end")
+    return found
+
+
+def varints(packed: bytes) -> Ints:
+    """Decode packed unsigned numbers, as 64 bits whose sign is the reader's affair."""
+    raw = np.frombuffer(packed, np.uint8)
+    if not len(raw):
+        return np.zeros(0, np.int64)
+    ends = np.flatnonzero(raw < 0x80)  # noqa: PLR2004 - the top bit says that more bytes follow
+    if not len(ends) or ends[-1] != len(raw) - 1:
+        raise DamagedPbfError("a number that does not end")
+    if len(ends) == len(raw):
+        return raw.astype(np.int64)
+    starts = np.concatenate(([0], ends[:-1] + 1))
+    sizes = ends - starts + 1
+    if sizes.max() > _MAX_VARINT_BYTES:
+        raise DamagedPbfError("a number of more than ten bytes")
+    value = (raw[starts] & 0x7F).astype(np.uint64)
+    rows = np.arange(len(starts))
+    for place in range(1, int(sizes.max())):
+        rows = rows[sizes[rows] > place]
+        value[rows] |= (raw[starts[rows] + place] & 0x7F).astype(np.uint64) << np.uint64(7 * place)
+    return value.view(np.int64)
+
+
+def deltas(packed: bytes) -> Ints:
+    """Decode packed, zigzag-coded differences to the numbers themselves."""
+    coded = varints(packed).view(np.uint64)
+    half = (coded >> np.uint64(1)).view(np.int64)
+    return np.cumsum(np.where(coded & np.uint64(1), ~half, half))
+
+
+def read_blocks(path: Path, work: Callable[[Block], _T]) -> Iterator[_T]:
+    """Yield what `work` makes of every block of a file, in the order of the file.
+
+    Raises
+    ------
+    InputError
+        The file is truncated or damaged; the message says from which byte on.
+    UnusualPbfError
+        The file is valid and not read here.
+    """
+    with path.open("rb") as file, ThreadPoolExecutor(_THREADS) as pool:
+        waiting: deque[tuple[int, Future[_T]]] = deque()
+        at = 0
+        try:
+            for begin, kind, blob in _blobs(file):
+                if kind == b"OSMHeader":
+                    _check_features(_unpack(blob))
+                elif kind == b"OSMData":
+                    waiting.append((begin, pool.submit(_worked, blob, work)))
+                if len(waiting) >= _AHEAD:
+                    at, done = waiting.popleft()
+                    yield done.result()
+            while waiting:
+                at, done = waiting.popleft()
+                yield done.result()
+        except (DamagedPbfError, zlib.error, IndexError, OverflowError) as error:
+            raise InputError(
+                f"damaged, or not an OpenStreetMap file ({error}, at or after byte {at}).",
+                where=str(path),
+                todo="Fetch or export it again.",
+            ) from None
+        finally:
+            for _, done in waiting:
+                done.cancel()
+
+
+def _worked(blob: bytes, work: Callable[[Block], _T]) -> _T:
+    return work(Block(_unpack(blob)))
+
+
+def _blobs(file: BinaryIO) -> Iterator[tuple[int, bytes, bytes]]:
+    """Yield the place, kind and content of every blob."""
+    while True:
+        at = file.tell()
+        head = file.read(4)
+        if not head:
+            return
+        size = int.from_bytes(head, "big")
+        if len(head) < 4 or size > _MAX_HEADER_BYTES:  # noqa: PLR2004 - the length of a length
+            raise DamagedPbfError("no block begins here")
+        kind, size = _blob_header(_exactly(file, size))
+        yield at, kind, _exactly(file, size)
+
+
+def _exactly(file: BinaryIO, size: int) -> bytes:
+    content = file.read(size)
+    if len(content) < size:
+        raise DamagedPbfError("the file is truncated")
+    return content
+
+
+def _blob_header(header: bytes) -> tuple[bytes, int]:
+    kind, size = b"", -1
+    for number, value in _fields(header, (0, len(header))):
+        if number == 1 and isinstance(value, tuple):
+            kind = header[slice(*value)]
+        elif number == 3 and isinstance(value, int):  # noqa: PLR2004 - field numbers are the format's
+            size = value
+    if not 0 <= size <= _MAX_BLOB_BYTES:
+        raise DamagedPbfError(f"a block of {size} bytes")
+    return kind, size
+
+
+def _unpack(blob: bytes) -> bytes:
+    """Return the content of a blob, of at most 32 MiB as the format has it, whatever it would grow to."""
+    packed: Span | None = None
+    raw_size = 0
+    for number, value in _fields(blob, (0, len(blob))):
+        if number == 1 and isinstance(value, tuple):
+            return blob[slice(*value)]
+        if number == 2 and isinstance(value, int):  # noqa: PLR2004 - field numbers are the format's
+            raw_size = value
+        elif number == 3 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's
+            packed = value
+        else:
+            raise UnusualPbfError("blobs that are packed otherwise than by zlib")
+    if packed is None or not 0 <= raw_size <= _MAX_BLOB_BYTES:
+        raise DamagedPbfError(f"a block that would unpack to {raw_size} bytes")
+    unpacker = zlib.decompressobj()
+    content = unpacker.decompress(memoryview(blob)[slice(*packed)], max(raw_size, 1))
+    if len(content) != raw_size or unpacker.unconsumed_tail:
+        raise DamagedPbfError("a block whose size is not the one it states")
+    return content
+
+
+def _check_features(header: bytes) -> None:
+    """Refuse what the reader would have to know about, as the format asks."""
+    for number, value in _fields(header, (0, len(header))):
+        if number == 4 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's
+            feature = header[slice(*value)].decode(errors="replace")
+            if feature not in _READ:
+                raise UnusualPbfError(f"the feature {feature}")
+
+
+def _fields(data: bytes, span: Span) -> Iterator[tuple[int, int | Span]]:
+    """Yield number and value of the fields of a message: an integer, or where the bytes lie."""
+    at, end = span
+    while at < end:
+        key, at = _varint(data, at)
+        wire = key & 7
+        if wire == _VARINT:
+            value, at = _varint(data, at)
+            yield key >> 3, value
+            continue
+        size, at = _varint(data, at) if wire == _BYTES else (_FIXED_BYTES.get(wire, -1), at)
+        if size < 0 or at + size > end:
+            raise DamagedPbfError("a field beyond its end")
+        yield key >> 3, (at, at + size)
+        at += size
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    """Return a number and where it ends."""
+    value = data[at]
+    if value < 0x80:  # noqa: PLR2004 - the top bit says that more bytes follow
+        return value, at + 1
+    value &= 0x7F
+    for shift in range(7, 7 * _MAX_VARINT_BYTES, 7):
+        at += 1
+        value |= (data[at] & 0x7F) << shift
+        if data[at] < 0x80:  # noqa: PLR2004 - as above
+            return value, at + 1
+    raise DamagedPbfError("a number of more than ten bytes")
+
+
+def _signed(value: int) -> int:
+    """Return a number of two's complement, 64 bits."""
+    value &= (1 << 64) - 1
+    return value - (1 << 64) if value >> 63 else value
+
+
+def _e7(nano: Ints) -> Ints:
+    """Return 1e-9 degrees in 1e-7, rounded towards zero as libosmium does, so that every tool reads the same place."""
+    return np.where(nano < 0, -(-nano // _NANO_PER_E7), nano // _NANO_PER_E7)
