@@ -52,8 +52,11 @@ for name in sys.argv[2:]:
             "crs": layer.crs().authid(),
             "features": layer.featureCount(),
             "legend": [rule.label() for rule in rules],
-            "faults": [rule.filterExpression() for rule in rules if QgsExpression(rule.filterExpression()).hasParserError()
-                       and rule.filterExpression()],
+            "faults": [
+                rule.filterExpression()
+                for rule in rules
+                if rule.filterExpression() and QgsExpression(rule.filterExpression()).hasParserError()
+            ],
             "title": layer.displayExpression(),
             "colours": sorted(colours),
         }
@@ -102,7 +105,8 @@ def test_geojson_follows_rfc_7946(out, layer):
         assert not {"coordinates", "geometries", "features"} & set(feature)  # section 7.1
         for position in positions(geometry):
             lon, lat = position  # never a third number
-            assert 24.9 < lon < 25.0 < 60.1 < lat < 60.2
+            assert 24.9 < lon < 25.0
+            assert 60.1 < lat < 60.2
         if geometry["type"] == "Polygon":
             for number, ring in enumerate(geometry["coordinates"]):
                 assert len(ring) >= 4
@@ -134,7 +138,7 @@ def test_ellipses_are_those_of_the_covariances(out):
     ellipses = geopandas.read_file(out / "ellipses.geojson").set_index("sign_id")
     assert ellipses.index.tolist() == ["s0", "s1", "s2", "s4"]
     metres = ellipses.to_crs(3879)
-    # the area inside is pi q sqrt(det), with q = 5.991 (95 % of chi² with two degrees of freedom); 48 corners lose 0.3 %
+    # pi q sqrt(det) with q = 5.991 (95 % of chi² with two degrees of freedom); 48 corners lose 0.3 %
     for sign, determinant in (("s0", 3.0), ("s1", 1.0), ("s2", 0.0625)):
         assert metres.geometry[sign].area == pytest.approx(np.pi * 5.9915 * determinant**0.5, rel=0.004)
     assert ellipses.loc["s1", ["semi_major_m", "semi_minor_m"]].tolist() == pytest.approx([2.4477, 2.4477], abs=1e-4)
