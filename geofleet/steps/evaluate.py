@@ -137,17 +137,7 @@ def evaluate(
     whole = _main_signs(read_table(REFERENCE, reference_path) if in_view else read_layer(reference_path).table)
     reference = whole.filter(pc.field("n_passes_in_view") > 0) if in_view else whole
     pairs = list(_pairs(map_, reference, clip_m=clip_m))
-    matches = pa.concat_tables(
-        match_layers(
-            pair.fused,
-            pair.reference,
-            pair.labels,
-            gate_m=gate_m,
-            match_on=match_on,
-            tile_zoom=config.aggregate.tile_zoom,
-        )
-        for pair in pairs
-    )
+    matches = _match_pairs(pairs, config)
     scores = score_matches(matches, gate_m=gate_m, match_on=match_on)
     used, ref_used = _used_rows(pairs, map_.num_rows, reference.num_rows)
     layers = {
@@ -269,6 +259,12 @@ def _clip(map_: pa.Table, rows: Ints, reference: pa.Table, ref_rows: Ints, clip_
     kept = is_within_reach(lon, lat, of_lon_deg=ref_lon, of_lat_deg=ref_lat, reach_m=clip_m)
     ref_kept = is_within_reach(ref_lon, ref_lat, of_lon_deg=lon, of_lat_deg=lat, reach_m=clip_m)
     return rows[kept], ref_rows[ref_kept]
+
+
+def _match_pairs(pairs: Sequence[_Pair], config: Config) -> pa.Table:
+    """Return the `matches` rows of all pairs."""
+    options = config.evaluate.model_dump(include={"gate_m", "match_on"}) | {"tile_zoom": config.aggregate.tile_zoom}
+    return pa.concat_tables(match_layers(pair.fused, pair.reference, pair.labels, **options) for pair in pairs)
 
 
 def _used_rows(pairs: Sequence[_Pair], n_map: int, n_ref: int) -> tuple[pa.Array, pa.Array]:

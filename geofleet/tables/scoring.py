@@ -118,8 +118,11 @@ def parse_requirements(texts: Sequence[str]) -> list[Requirement]:
 
 
 def missed_requirements(totals: Sequence[Mapping[str, Any]], requirements: Sequence[Requirement]) -> list[str]:
-    """Return a sentence for every requirement that a total misses; a score that is null misses it."""
-    missed = []
+    """Return a sentence for every requirement that a total misses.
+
+    What could not be scored has not been shown: a null score misses, and so does an evaluation without any sign.
+    """
+    missed = [] if totals else [f"{need.text} is missed: there was no sign to score." for need in requirements]
     for need in requirements:
         for total in totals:
             value = total[need.score]

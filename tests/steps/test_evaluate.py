@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import csv
 import json
 from math import sqrt
 
@@ -8,10 +9,10 @@ import pyarrow.compute as pc
 import pytest
 
 from geofleet.config import load_config
-from geofleet.errors import ConfigError
-from geofleet.steps.evaluate import evaluate, missed_requirements, parse_requirements
-from geofleet.tables.schemas import MATCHES, SCORES, SIGNS
-from geofleet.tables.store import read_table, write_table
+from geofleet.errors import ConfigError, TableError
+from geofleet.steps.evaluate import CLIP_M, evaluate, missed_requirements, parse_requirements
+from geofleet.tables.schemas import MATCHES, REFERENCE, SCORES, SIGNS
+from geofleet.tables.store import build_table, lonlat, read_table, write_table
 
 PAPER = load_config()
 
@@ -166,3 +167,176 @@ def test_requirements(score, make_signs):
 def test_what_is_no_requirement_is_refused(text):
     with pytest.raises(ConfigError, match="is not a requirement"):
         parse_requirements([text])
+
+
+def test_every_layer_has_a_style_and_stands_in_the_geopackage(score, make_signs):
+    out = score(make_signs([(1, 0)], ["stop"]), make_signs([(0, 0)], ["stop"])).out
+    layers = {path.stem for path in out.glob("*.geojson")}
+    assert layers == {"scores", "ellipses", "match_lines", "reference", "fused", "matches"}
+    assert {path.stem for path in out.glob("*.qml")} == layers
+    assert set(geopandas.list_layers(out / "results.gpkg")["name"]) == layers | {"layer_styles"}
+
+
+def test_signs_without_covariance_have_no_ellipse_and_are_counted(score, make_signs):
+    # of the five: one whole, one unknown, one half known, one impossible (correlation above 1), one without extent
+    map_ = make_signs(
+        [(x, 0) for x in range(0, 500, 100)],
+        ["stop"] * 5,
+        var_e_m2=[1.0, None, 1.0, 1.0, 0.0],
+        var_n_m2=[1.0, None, None, 1.0, 0.0],
+        cov_en_m2=[0.0, None, 0.0, 1.5, 0.0],
+    )
+    result = score(map_, make_signs([(0, 0)], ["stop"]))
+    assert geopandas.read_file(result.out / "ellipses.geojson")["sign_id"].tolist() == ["s0"]
+    assert result.counts["map_signs_without_ellipse"] == 4
+
+
+def evaluate_with(tmp_path, map_, reference, *overrides, schema=SIGNS, **options):
+    write_table(SIGNS, map_, tmp_path / "map.parquet")
+    write_table(schema, reference, tmp_path / "reference.parquet")
+    config = load_config("paper", overrides)
+    paths = [tmp_path / name for name in ("map.parquet", "reference.parquet", "out")]
+    return evaluate(*paths, config=config, **options)
+
+
+def test_clip_scores_what_both_maps_cover(tmp_path, make_signs):
+    # the map is one road to the east, the reference a road to the north; they share the corner
+    map_ = make_signs([(x, 0) for x in range(0, 1000, 50)], ["stop"] * 20)
+    reference = make_signs([(1, y) for y in range(0, 1000, 50)], ["stop"] * 20)
+    result = evaluate_with(tmp_path, map_, reference, clip_m=60.0)
+    (total,) = result.totals
+    # of the map 0 and 50 m, of the reference 0 and 50 m, are within 60 m of a sign of the other
+    assert (total["tp"], total["fp"], total["fn"]) == (1, 1, 1)
+    assert result.counts["map_signs_clipped"] == result.counts["reference_signs_clipped"] == 18
+    assert len(geopandas.read_file(result.out / "reference.geojson")) == 2
+    assert len(geopandas.read_file(result.out / "fused.geojson")) == 2
+
+
+def test_clip_of_maps_far_apart_leaves_nothing_and_says_so(tmp_path, make_signs):
+    result = evaluate_with(tmp_path, make_signs([(0, 0)], ["stop"]), make_signs([(900, 0)], ["stop"]), clip_m=100.0)
+    assert result.totals == ()
+    assert missed_requirements(result.totals, parse_requirements(["fp<1"])) == [
+        "fp<1 is missed: there was no sign to score."
+    ]
+    assert result.counts["map_signs_clipped"] == 1
+
+
+def test_in_view_leaves_out_what_no_pass_saw(tmp_path, make_signs):
+    signs = make_signs([(0, 0), (100, 0)], ["stop"] * 2)
+    columns = {name: signs[name] for name in signs.column_names if name not in ("geometry", "bbox")}
+    seen = {"run_id": "r0", "n_passes_in_view": [3, 0], "n_frames_in_view": [30, 0]}
+    reference = build_table(REFERENCE, columns | seen, geometry=lonlat(signs))
+    map_ = make_signs([(0, 0)], ["stop"], run_id="r0", method="dbscan-first", n_vehicles=3)
+    result = evaluate_with(tmp_path, map_, reference, schema=REFERENCE, in_view=True)
+    assert (result.totals[0]["tp"], result.totals[0]["fn"]) == (1, 0)
+    assert result.counts["reference_signs_never_in_view"] == 1
+    assert evaluate_with(tmp_path, map_, reference, schema=REFERENCE).totals[0]["fn"] == 1
+
+
+def test_in_view_needs_a_reference_table(tmp_path, make_signs):
+    map_ = make_signs([(0, 0)], ["stop"])
+    with pytest.raises(TableError, match="n_passes_in_view"):
+        evaluate_with(tmp_path, map_, map_, in_view=True)
+
+
+def test_confusion_is_of_position_and_does_not_cross_signs_of_one_pole(score, make_signs):
+    # two signs on one pole, both right; a speed limit misread; a ghost
+    map_ = make_signs([(0.3, 0), (0, 0.3), (100.5, 0), (300, 0)], ["stop", "yield", "speed_limit:30", "no_entry"])
+    reference = make_signs([(0, 0), (0, 0), (100, 0), (200, 0)], ["stop", "yield", "speed_limit:50", "stop"])
+    expected = [("speed_limit:50", "speed_limit:30", 1), ("stop", "stop", 1), ("yield", "yield", 1)]
+    for match_on in ("class", "concept", "none"):
+        result = score(map_, reference, f"match_on={match_on}")
+        assert [(row["ref_class"], row["fused_class"], row["n"]) for row in result.confusion] == expected
+    assert (result.out / "confusion.csv").read_text().splitlines()[1] == ",given,0,speed_limit:50,speed_limit:30,1"
+
+
+def test_sources_are_scored_as_maps_of_their_own(score, make_signs):
+    map_ = make_signs([(0, 0), (0.5, 0), (100, 0)], ["stop"] * 3, source=["a", "b", "b"])
+    reference = make_signs([(0, 0), (100, 0)], ["stop"] * 2)
+    result = score(map_, reference)
+    assert [(r["source"], r["tp"], r["fp"], r["fn"], r["f1"]) for r in result.sources] == [
+        ("a", 1, 0, 1, pytest.approx(2 / 3)),
+        ("b", 2, 0, 0, 1.0),
+    ]
+    assert result.totals[0]["fp"] == 1
+    assert (result.out / "sources.csv").is_file()
+
+
+def test_one_source_is_the_total_and_has_no_table(score, make_signs):
+    result = score(make_signs([(0, 0)], ["stop"]), make_signs([(0, 0)], ["stop"]))
+    assert result.sources == ()
+    assert not (result.out / "sources.csv").exists()
+
+
+def test_the_summary_tells_mean_sd_and_nulls(score, make_signs):
+    # r0 finds both signs at 1 m, r1 one of two at 0 m, r2 none: GOSPA_M is 1, √2 and null
+    map_ = make_signs(
+        [(1, 0), (101, 0), (0, 0), (50, 0)],
+        ["stop"] * 4,
+        run_id=["r0", "r0", "r1", "r2"],
+        method="m",
+        n_vehicles=5,
+    )
+    reference = make_signs([(0, 0), (100, 0)] * 3, ["stop"] * 6, run_id=["r0", "r0", "r1", "r1", "r2", "r2"])
+    result = score(map_, reference)
+    rows = {row["score"]: row for row in result.summary}
+    values = (1.0, sqrt(2))
+    assert rows["gospa_m"] == {
+        "method": "m",
+        "n_vehicles": 5,
+        "score": "gospa_m",
+        "mean": pytest.approx(sum(values) / 2, abs=1e-6),
+        "sd": pytest.approx((values[1] - values[0]) / sqrt(2), abs=1e-6),
+        "n": 2,
+        "n_null": 1,
+    }
+    assert (rows["f1"]["n"], rows["f1"]["n_null"], rows["tp"]["mean"]) == (3, 0, 1.0)
+    assert rows["recall"]["mean"] == pytest.approx((1 + 0.5 + 0) / 3)
+    missed = missed_requirements(result.totals, parse_requirements(["gospa_m<5"]))
+    assert len(missed) == 1
+    assert "run r2" in missed[0]
+    assert "null" in missed[0]
+
+
+def test_gospa_m_is_its_two_parts(score, make_signs):
+    map_ = make_signs([(1, 0), (200, 0)], ["stop"] * 2)
+    (total,) = score(map_, make_signs([(0, 0), (300, 0)], ["stop"] * 2)).totals
+    assert total["cardinality_m2"] == pytest.approx(4.0)
+    assert total["gospa_m"] ** 2 == pytest.approx(total["mse_m2"] + total["cardinality_m2"])
+
+
+def test_csv_tables_are_the_rows_of_scores(score, make_signs):
+    map_ = make_signs([(x, 0) for x in range(0, 2000, 100)], ["stop", "yield"] * 10)
+    result = score(map_, make_signs([(x + 0.5, 0) for x in range(0, 2000, 200)], ["stop"] * 10))
+    scores = read_table(SCORES, result.out / "scores.parquet")
+    for name, kept in (
+        ("tiles", (pc.field("tile") != "all") & (pc.field("concept") == "all")),
+        ("concepts", (pc.field("tile") == "all") & (pc.field("concept") != "all")),
+    ):
+        rows = scores.filter(kept).drop_columns(["geometry", "bbox"]).to_pylist()
+        with (result.out / f"{name}.csv").open(encoding="utf-8", newline="") as stream:
+            written = list(csv.DictReader(stream))
+        assert written == [{key: "" if v is None else str(v) for key, v in row.items()} for row in rows]
+        assert len(written) > 1
+        assert any(row["gospa_m"] == "" for row in written) == (name == "concepts")
+
+
+def test_two_encodings_of_one_map_score_perfectly(shared_data, tmp_path):
+    paths = [shared_data / "osm" / f"helsinki_signs_roads.osm{suffix}" for suffix in (".pbf", ".gz")]
+    (total,) = evaluate(*paths, tmp_path / "out", config=load_config("paper", ["match_on=concept"])).totals
+    assert total["tp"] > 2000
+    assert (total["gospa_m"], total["f1"]) == (0.0, 1.0)
+
+
+def test_an_extract_against_an_inventory(shared_data, tmp_path):
+    """The figures and their reasons stand in docs/evaluation.md."""
+    extract = shared_data / "osm" / "osm2streets_neukolln_input.osm"
+    inventory = shared_data / "inventory" / "neukoelln_man_made.geojson"
+    config = load_config("paper", ["match_on=concept"])
+    (whole,) = evaluate(extract, inventory, tmp_path / "whole", config=config).totals
+    clipped = evaluate(extract, inventory, tmp_path / "clipped", config=config, clip_m=CLIP_M)
+    (common,) = clipped.totals
+    assert (whole["tp"], common["tp"]) == (4, 4)
+    assert whole["rmse_m"] == 0.0
+    assert whole["fn"] - common["fn"] == clipped.counts["reference_signs_clipped"] > 100
+    assert common["fn"] == 8
