@@ -68,7 +68,7 @@ def test_what_cannot_be_read_leaves_nothing_behind(raw, tmp_path):
     out = tmp_path / "out" / "table.parquet"
     with pytest.raises(InputError, match=r"NOTICE.md: the first line names no columns"):
         ingest_signs([good, odd], out)
-    with pytest.raises(InputError, match=r"format osm, which is not read here.*RTKLIB"):
+    with pytest.raises(InputError, match=r"not in a format that is read here.*RTKLIB"):
         ingest_drive([good], out)
     with pytest.raises(InputError, match="unknown format 'shape'"):
         ingest_signs([good], out, file_format="shape")
