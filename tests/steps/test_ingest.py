@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from geofleet.errors import InputError
+from geofleet.errors import ConfigError, InputError
 from geofleet.formats import layers
 from geofleet.steps.ingest import ingest_drive, ingest_lanes, ingest_signs, recognise
 from geofleet.tables.manifest import manifest_path
@@ -70,7 +70,7 @@ def test_what_cannot_be_read_leaves_nothing_behind(raw, tmp_path):
         ingest_signs([good, odd], out)
     with pytest.raises(InputError, match=r"not in a format that is read here.*RTKLIB"):
         ingest_drive([good], out)
-    with pytest.raises(InputError, match="unknown format 'shape'"):
+    with pytest.raises(ConfigError, match="unknown format 'shape'"):
         ingest_signs([good], out, file_format="shape")
     with pytest.raises(InputError, match="no input"):
         ingest_lanes([], out)
