@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from geofleet.errors import ConfigError, InputError
-from geofleet.formats import inventory, lanelet2, lanelet2_map, opendrive, osm
-from geofleet.formats.reading import LayerRead, read_head
+from geofleet.formats import osm
+from geofleet.formats.reading import LayerRead, LayerStream, read_head
 from geofleet.tables.schemas import LANES, SIGNS, Schema
 from geofleet.tables.store import read_table
 
@@ -19,49 +20,59 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-_OWN = "geofleet"
+_OWN, _OPENDRIVE, _LANELET2, _INVENTORY = "geofleet", "opendrive", "lanelet2", "inventory"
 _MARK = b"geofleet:table"
 
 
 @dataclass(frozen=True, slots=True)
 class LayerFormat:
-    """A format: what it is called, its readers, and the options that they take."""
+    """A format: what it is called, the module that reads it, and the options that its readers take.
+
+    The module is imported when a file of the format is read: no map pays for what another one needs.
+    """
 
     what: str
-    read_signs: Callable[..., LayerRead]
-    read_lanes: Callable[..., LayerRead] | None = None
+    module: str
+    has_lanes: bool = True
     sign_options: frozenset[str] = frozenset()
     lane_options: frozenset[str] = frozenset()
 
+    def reader(self, schema: Schema) -> Callable[..., LayerRead | LayerStream]:
+        """Return the function that reads a table of this format."""
+        read: Callable[..., LayerRead | LayerStream] = getattr(
+            import_module(f"geofleet.formats.{self.module}"), f"read_{schema.name}"
+        )
+        return read
 
-def _own_table(schema: Schema) -> Callable[[Path], LayerRead]:
-    return lambda path: LayerRead(read_table(schema, path), _OWN)
+    def options(self, schema: Schema) -> frozenset[str]:
+        """Return the names of the options that the reader takes."""
+        if self.module == "inventory":
+            return frozenset({"columns", *import_module("geofleet.formats.inventory").OPTIONS})
+        return self.sign_options if schema is SIGNS else self.lane_options
 
 
 FORMATS: Mapping[str, LayerFormat] = MappingProxyType(
     {
-        _OWN: LayerFormat("a table of geofleet (.parquet)", _own_table(SIGNS), _own_table(LANES)),
+        _OWN: LayerFormat("a table of geofleet (.parquet)", "layers"),
         osm.FORMAT: LayerFormat(
-            "OpenStreetMap (.osm.pbf, .osm, .osm.gz, .osm.bz2)", osm.read_signs, osm.read_lanes, frozenset({"roads"})
+            "OpenStreetMap (.osm.pbf, .osm, Overpass .json; .gz, .bz2)", "osm", sign_options=frozenset({"roads"})
         ),
-        opendrive.FORMAT: LayerFormat(
+        _OPENDRIVE: LayerFormat(
             "OpenDRIVE (.xodr)",
-            opendrive.read_signs,
-            opendrive.read_lanes,
-            frozenset({"crs", "origin", "country"}),
-            frozenset({"crs", "origin"}),
+            "opendrive",
+            sign_options=frozenset({"crs", "origin", "country"}),
+            lane_options=frozenset({"crs", "origin"}),
         ),
-        lanelet2.FORMAT: LayerFormat(
+        _LANELET2: LayerFormat(
             "Lanelet2 (.osm)",
-            lanelet2.read_signs,
-            lanelet2.read_lanes,
-            frozenset({"origin", "utm"}),
-            frozenset({"origin", "utm"}),
+            "lanelet2",
+            sign_options=frozenset({"origin", "utm"}),
+            lane_options=frozenset({"origin", "utm"}),
         ),
-        inventory.FORMAT: LayerFormat(
+        _INVENTORY: LayerFormat(
             "a sign inventory (GeoJSON, GeoPackage, Shapefile, FlatGeobuf, GeoParquet, CSV)",
-            inventory.read_signs,
-            sign_options=inventory.OPTIONS | {"columns"},
+            "inventory",
+            has_lanes=False,
         ),
     }
 )
@@ -78,15 +89,30 @@ def recognise(path: Path) -> str:
     """
     head = read_head(path)
     if head.startswith(b"PAR1"):
-        return _OWN if _is_own_table(path) else inventory.FORMAT
-    if opendrive.detect(head):
-        return opendrive.FORMAT
-    if osm.detect(head):
-        return lanelet2.FORMAT if lanelet2_map.is_lanelet2(path) else osm.FORMAT
-    return inventory.FORMAT if inventory.detect(head) else ""
+        return _OWN if _is_own_table(path) else _INVENTORY
+    encoding = osm.detect(head)
+    if encoding in {"osm", "osm.gz"}:
+        return _LANELET2 if import_module("geofleet.formats.lanelet2_map").is_lanelet2(path) else osm.FORMAT
+    if encoding:
+        return osm.FORMAT
+    if import_module("geofleet.formats.opendrive").detect(head):
+        return _OPENDRIVE
+    return _INVENTORY if import_module("geofleet.formats.inventory").detect(head) else ""
 
 
-def read_layer(path: Path, schema: Schema = SIGNS, *, file_format: str = "auto", **options: Any) -> LayerRead:
+def read_signs(path: Path) -> LayerRead:
+    """Read a `signs` table of our own."""
+    return LayerRead(read_table(SIGNS, path), _OWN)
+
+
+def read_lanes(path: Path) -> LayerRead:
+    """Read a `lanes` table of our own."""
+    return LayerRead(read_table(LANES, path), _OWN)
+
+
+def read_layer(
+    path: Path, schema: Schema = SIGNS, *, file_format: str = "auto", **options: Any
+) -> LayerRead | LayerStream:
     """Read the signs, or the roads and lanes, of a file.
 
     Parameters
@@ -112,12 +138,10 @@ def read_layer(path: Path, schema: Schema = SIGNS, *, file_format: str = "auto",
         what = f"unknown format {found!r}" if found else "this format is not known"
         raise InputError(f"{what}.", where=str(path), todo=f"Supported are {SUPPORTED}.")
     layer = FORMATS[found]
-    reader, takes = (
-        (layer.read_signs, layer.sign_options) if schema is SIGNS else (layer.read_lanes, layer.lane_options)
-    )
-    if reader is None:
+    if schema is LANES and not layer.has_lanes:
         raise InputError(f"{layer.what} holds no {schema.name}.", where=str(path), todo="Give a map with roads.")
     given = {name: value for name, value in options.items() if value is not None}
+    takes = layer.options(schema)
     foreign = sorted(set(given) - takes - {"roads"})  # roads are on by default, also where there are none
     if foreign:
         raise ConfigError(
@@ -125,7 +149,7 @@ def read_layer(path: Path, schema: Schema = SIGNS, *, file_format: str = "auto",
             where=str(path),
             todo=f"It takes {', '.join(f'--{name}'.replace('_', '-') for name in sorted(takes)) or 'no option'}.",
         )
-    return reader(path, **{name: value for name, value in given.items() if name in takes})
+    return layer.reader(schema)(path, **{name: value for name, value in given.items() if name in takes})
 
 
 def _is_own_table(path: Path) -> bool:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import pyarrow as pa
-
 from geofleet.formats.osm_rows import SignRows, clean_nodes
 from geofleet.formats.osm_scan import as_pbf, detect, explained, read_roads, refuse_lanelet2, sign_nodes
 from geofleet.formats.reading import LayerRead, LayerStream
@@ -15,19 +13,13 @@ from geofleet.tables.store import build_table
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["FORMAT", "detect", "read_lanes", "read_signs", "stream_signs"]
+__all__ = ["FORMAT", "detect", "read_lanes", "read_signs"]
 
 FORMAT = "osm"
 EDGE = "way nodes beyond the edge of the file"
 
 
-def read_signs(path: Path, *, roads: bool = True) -> LayerRead:
-    """Read the signs of an OpenStreetMap file; parameters and errors as `stream_signs`."""
-    layer = stream_signs(path, roads=roads)
-    return LayerRead(pa.concat_tables(layer.pieces), layer.file_format, layer.skipped, layer.found)
-
-
-def stream_signs(path: Path, *, roads: bool = True) -> LayerStream:
+def read_signs(path: Path, *, roads: bool = True) -> LayerStream:
     """Read the signs of an OpenStreetMap file a piece at a time.
 
     What is held are 20 bytes a node with signs, the different tags of such nodes and, with `roads`, the drivable ways
@@ -57,7 +49,7 @@ def stream_signs(path: Path, *, roads: bool = True) -> LayerStream:
     if ways is not None:
         rows, told = rows.with_roads(ways)
         found |= told | {EDGE: ways.n_missing_nodes}
-    return LayerStream(rows.pieces(), FORMAT, skipped, found)
+    return LayerStream(rows.pieces, FORMAT, skipped, found)
 
 
 def read_lanes(path: Path) -> LayerRead:

@@ -29,7 +29,7 @@ _TO_READ = "Fetch it again with [out:json], and `out body` or `out geom`."
 
 def looks_like(head: bytes) -> bool:
     """Tell whether a file's first bytes are those of an Overpass answer."""
-    return _LOOKS.match(head) is not None
+    return _LOOKS.match(head) is not None and b'"FeatureCollection"' not in head
 
 
 def gunzipped(head: bytes) -> bytes:

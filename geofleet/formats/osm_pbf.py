@@ -39,6 +39,7 @@ _MAX_VARINT_BYTES = 10
 _READ = frozenset({"OsmSchema-V0.6", "DenseNodes"})
 _THREADS, _AHEAD = 2, 4
 _NANO_PER_E7 = 100
+_PEEK_BYTES = 32
 _VARINT, _BYTES = 0, 2
 _FIXED_BYTES = {1: 8, 5: 4}
 
@@ -106,15 +107,17 @@ class Block:
         """
         _, groups, numbers = self._parts
         for group in groups:
-            for number, value in _fields(self.data, group):
-                if number == 1:
-                    raise UnusualPbfError("nodes that are not dense")
-                if number == 2 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's
-                    yield self._dense(value, numbers, tagged=tagged)
+            number, value = next(
+                _fields(self.data, group), (0, 0)
+            )  # a group holds one kind, and dense nodes are one field
+            if number == 1:
+                raise UnusualPbfError("nodes that are not dense")
+            if number == 2 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's
+                yield self._dense(value, numbers, tagged=tagged)
 
     def has_nodes(self) -> bool:
         """Tell whether the block holds nodes, without decoding them."""
-        return any(number in {1, 2} for group in self._parts[1] for number, _ in _fields(self.data, group))
+        return any(next(_fields(self.data, group), (0, 0))[0] in {1, 2} for group in self._parts[1])
 
     def ways(self, is_wanted: Callable[[bytes], bool]) -> Iterator[tuple[int, bytes, bytes, bytes]]:
         """Yield id, packed keys, packed values and packed references of the ways whose packed keys are wanted."""
@@ -196,8 +199,10 @@ def deltas(packed: bytes) -> Ints:
     return np.cumsum(np.where(coded & np.uint64(1), ~half, half))
 
 
-def read_blocks(path: Path, work: Callable[[Block], _T]) -> Iterator[_T]:
+def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = False) -> Iterator[_T]:
     """Yield what `work` makes of every block of a file, in the order of the file.
+
+    Blocks of ways and relations come without their content with `nodes_only`, which spares unpacking it.
 
     Raises
     ------
@@ -214,7 +219,7 @@ def read_blocks(path: Path, work: Callable[[Block], _T]) -> Iterator[_T]:
                 if kind == b"OSMHeader":
                     _check_features(_unpack(blob))
                 elif kind == b"OSMData":
-                    waiting.append((begin, pool.submit(_worked, blob, work)))
+                    waiting.append((begin, pool.submit(_worked, blob, work, nodes_only)))
                 if len(waiting) >= _AHEAD:
                     at, done = waiting.popleft()
                     yield done.result()
@@ -232,8 +237,8 @@ def read_blocks(path: Path, work: Callable[[Block], _T]) -> Iterator[_T]:
                 done.cancel()
 
 
-def _worked(blob: bytes, work: Callable[[Block], _T]) -> _T:
-    return work(Block(_unpack(blob)))
+def _worked(blob: bytes, work: Callable[[Block], _T], nodes_only: bool) -> _T:  # noqa: FBT001 - passed on
+    return work(Block(_unpack(blob, nodes_only=nodes_only)))
 
 
 def _blobs(file: BinaryIO) -> Iterator[tuple[int, bytes, bytes]]:
@@ -269,7 +274,7 @@ def _blob_header(header: bytes) -> tuple[bytes, int]:
     return kind, size
 
 
-def _unpack(blob: bytes) -> bytes:
+def _unpack(blob: bytes, *, nodes_only: bool = False) -> bytes:
     """Return the content of a blob, of at most 32 MiB as the format has it, whatever it would grow to."""
     packed: Span | None = None
     raw_size = 0
@@ -284,11 +289,35 @@ def _unpack(blob: bytes) -> bytes:
             raise UnusualPbfError("blobs that are packed otherwise than by zlib")
     if packed is None or not 0 <= raw_size <= _MAX_BLOB_BYTES:
         raise DamagedPbfError(f"a block that would unpack to {raw_size} bytes")
+    content = memoryview(blob)[slice(*packed)]
+    return b"" if nodes_only and _is_without_nodes(content, raw_size) else _inflated(content, raw_size)
+
+
+def _inflated(packed: memoryview, raw_size: int) -> bytes:
     unpacker = zlib.decompressobj()
-    content = unpacker.decompress(memoryview(blob)[slice(*packed)], max(raw_size, 1))
+    content = unpacker.decompress(packed, max(raw_size, 1))
     if len(content) != raw_size or unpacker.unconsumed_tail:
         raise DamagedPbfError("a block whose size is not the one it states")
     return content
+
+
+def _is_without_nodes(packed: memoryview, raw_size: int) -> bool:
+    """Tell whether a block is one group of ways or relations, by its first bytes and what follows its strings."""
+    unpacker = zlib.decompressobj()
+    head = unpacker.decompress(packed, _PEEK_BYTES)
+    if head[:1] != b"\x0a":
+        return False
+    size, at = _varint(head, 1)
+    if at + size + _PEEK_BYTES > raw_size:
+        return False
+    beyond = at + size + _PEEK_BYTES - len(head)
+    if beyond > 0:
+        head += unpacker.decompress(unpacker.unconsumed_tail, beyond)
+    at += size
+    if len(head) < at + _PEEK_BYTES or head[at] != 0x12:  # noqa: PLR2004 - field 2, bytes: a group
+        return False
+    size, at = _varint(head, at + 1)
+    return at + size == raw_size and head[at] >> 3 > 2  # noqa: PLR2004 - ways, relations, changesets
 
 
 def _check_features(header: bytes) -> None:

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 
-from geofleet.algorithms.geodesy import EnuFrame
-
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -99,6 +97,8 @@ def nearest_road(roads: Roads, lon: Floats, lat: Floats) -> NearestRoad:
 
     Of equally near segments the first of the file counts.
     """
+    from geofleet.algorithms.geodesy import EnuFrame  # noqa: PLC0415  (brings pyproj, which `--no-roads` spares)
+
     run = np.full(len(lon), -1, np.int64)
     bearing = np.full(len(lon), np.nan)
     is_right = np.zeros(len(lon), bool)

@@ -217,7 +217,7 @@ def sign_nodes(pbf: Path) -> SignNodes:
     tagsets: dict[Tagset, int] = {}
     columns: list[tuple[Ints, NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]] = []
     has_nodes = False
-    for found in read_blocks(pbf, _signs_in):
+    for found in read_blocks(pbf, _signs_in, nodes_only=True):
         has_nodes |= found.has_nodes
         number = np.array([tagsets.setdefault(tags, len(tagsets)) for tags in found.tagsets], np.int32)
         for node_id, lon, lat, own in found.groups:
@@ -237,7 +237,7 @@ def _int32(e7: Ints) -> NDArray[np.int32]:
 
 def _signs_in(block: Block) -> _Found:
     """Return the sign nodes of a block."""
-    if not any(map(block.holds_string, _MARKS)):
+    if not (block.has_nodes() and any(map(block.holds_string, _MARKS))):
         return _Found(block.has_nodes(), [], [])
     strings = block.strings
     key_role, is_word, highway = _roles(strings)
@@ -314,7 +314,7 @@ def read_roads(pbf: Path) -> Roads:
     way_of = np.repeat(np.arange(len(ways)), [len(way.refs) for way in ways])
     wanted = np.unique(refs)
     place = np.full((len(wanted), 2), np.iinfo(np.int64).max)
-    for found in read_blocks(pbf, lambda block: _nodes_in(block, wanted)):
+    for found in read_blocks(pbf, lambda block: _nodes_in(block, wanted), nodes_only=True):
         for index, lon, lat in found:
             place[index, 0], place[index, 1] = lon, lat
     there = (np.abs(place) <= _MAX_E7).all(axis=1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from geofleet.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     import pyarrow as pa
@@ -42,20 +42,27 @@ class LayerRead:
 
 @dataclass(frozen=True, slots=True)
 class LayerStream:
-    """A table read from one file, in pieces that need not be held together.
+    """A table read from one file that need not be held as a whole.
 
     Parameters
     ----------
     pieces
-        Tables in the schema asked for, each sorted by key and all of it before the next.
+        Gives tables in the schema asked for, each sorted by key and all of it before the next; at least one.
     file_format, skipped, found
         As `LayerRead`.
     """
 
-    pieces: Iterator[pa.Table]
+    pieces: Callable[[], Iterator[pa.Table]]
     file_format: str
     skipped: dict[str, int] = field(default_factory=dict)
     found: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def table(self) -> pa.Table:
+        """All rows."""
+        import pyarrow as pa  # noqa: PLC0415  (this module is also read where no table is)
+
+        return pa.concat_tables(self.pieces())
 
 
 def read_head(path: Path) -> bytes:

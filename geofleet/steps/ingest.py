@@ -17,22 +17,20 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from geofleet.errors import ConfigError, InputError
-from geofleet.formats import drives, layers
-from geofleet.formats.reading import read_head
+from geofleet.formats import layers
+from geofleet.formats.reading import LayerStream, read_head
 from geofleet.tables.manifest import write_manifest
 from geofleet.tables.schemas import DRIVES, LANES, SIGNS
-from geofleet.tables.store import sort_by_key, write_table
+from geofleet.tables.store import sort_by_key, write_pieces
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from geofleet.formats.reading import LayerRead
     from geofleet.tables.schemas import Schema
 
     Progress = Callable[[int, int], None]
-    Reader = Callable[[Path], LayerRead]
-
-DRIVE_FORMATS = {drives.FORMAT: "RTKLIB solution (.pos)"}
+    Reader = Callable[[Path], LayerRead | LayerStream]
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,13 +141,35 @@ def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def ingest_drive(
-    inputs: Sequence[Path], out: Path, *, file_format: str = "auto", progress: Progress | None = None
+    inputs: Sequence[Path],
+    out: Path,
+    *,
+    file_format: str = "auto",
+    columns: Mapping[str, str] | Path | None = None,
+    crs: str | None = None,
+    origin: tuple[float, float] | None = None,
+    utm: tuple[str, float, float] | None = None,
+    progress: Progress | None = None,
 ) -> IngestResult:
-    """Read trajectories, one drive a file, into one `drives` table; parameters and errors as `ingest_signs`."""
-    readers = {drives.FORMAT: drives.read_drive}
-    return _ingest(
-        DRIVES, "fix_quality", _plan(inputs, file_format, DRIVE_FORMATS, readers), out, progress=progress, settings={}
-    )
+    """Read trajectories, one drive a file, into one `drives` table; other parameters and errors as `ingest_signs`.
+
+    Parameters
+    ----------
+    columns, crs, origin, utm
+        Of a CSV file, as in `formats.drive_csv.read_epochs`; with any of them a file of unknown kind is read as CSV.
+    """
+    from geofleet.formats import drives  # noqa: PLC0415  (brings numba and pandas, which maps do without)
+
+    given = {"columns": columns, "crs": crs, "origin": origin, "utm": utm}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+
+    def reader(name: str) -> Reader:
+        return lambda path: drives.read_drive(path, name, **options)
+
+    chosen = drives.CSV if options and file_format == "auto" else file_format
+    plan = _plan(inputs, chosen, drives.FORMATS, {name: reader(name) for name in drives.FORMATS})
+    settings = {name: str(value.name if isinstance(value, Path) else value) for name, value in options.items()}
+    return _ingest(DRIVES, "fix_quality", plan, out, progress=progress, settings=settings)
 
 
 def recognise(path: Path) -> str:
@@ -160,7 +180,9 @@ def recognise(path: Path) -> str:
     InputError
         The file is missing, unreadable or empty.
     """
-    return drives.FORMAT if drives.detect(read_head(path)) else ""
+    from geofleet.formats import drives  # noqa: PLC0415  (as above)
+
+    return drives.detect(read_head(path))
 
 
 def _plan(
@@ -194,28 +216,43 @@ def _ingest(
     """Read every input, put the rows together, write the table and, last, its manifest."""
     skipped: Counter[str] = Counter()
     found: Counter[str] = Counter()
-    tables = []
+    kinds: Counter[str] = Counter()
+    layers_read = []
     for done, (path, _, reader) in enumerate(plan):
         if progress:
             progress(done, len(plan))
         layer = reader(path)
         skipped.update(layer.skipped)
         found.update(layer.found)
-        tables.append(layer.table)
-    table = _together(schema, tables, skipped)
-    write_table(schema, table, Path(out))
+        layers_read.append(layer)
+    n_rows = write_pieces(schema, _counted(_pieces(schema, layers_read, skipped), kind, kinds), Path(out))
     if progress:
         progress(len(plan), len(plan))
-    kinds = {name or "unknown": n for name, n in Counter(table[kind].to_pylist()).most_common()}
-    formats = {str(path): file_format for path, file_format, _ in plan}
+    by_kind = {name or "unknown": n for name, n in kinds.most_common()}
     write_manifest(
         Path(out),
         step=f"ingest {schema.name}",
         inputs=[path for path, *_ in plan],
         settings=settings,
-        counts={"rows": table.num_rows, "by_kind": kinds, "found": dict(found), "skipped": dict(skipped)},
+        counts={"rows": n_rows, "by_kind": by_kind, "found": dict(found), "skipped": dict(skipped)},
     )
-    return IngestResult(schema.name, Path(out), table.num_rows, kinds, dict(found), dict(skipped), formats)
+    formats = {str(path): file_format for path, file_format, _ in plan}
+    return IngestResult(schema.name, Path(out), n_rows, by_kind, dict(found), dict(skipped), formats)
+
+
+def _pieces(schema: Schema, read: list[LayerRead | LayerStream], skipped: Counter[str]) -> Iterator[pa.Table]:
+    """Return the rows to write: of one file piece by piece, where it comes so; of several put together."""
+    only = read[0]
+    if len(read) == 1 and isinstance(only, LayerStream):
+        return only.pieces()
+    return iter([_together(schema, [layer.table for layer in read], skipped)])
+
+
+def _counted(pieces: Iterator[pa.Table], kind: str, kinds: Counter[str]) -> Iterator[pa.Table]:
+    """Pass tables on, and count what is in a column of theirs."""
+    for piece in pieces:
+        kinds.update(piece[kind].to_pylist())
+        yield piece
 
 
 def _together(schema: Schema, tables: list[pa.Table], skipped: Counter[str]) -> pa.Table:

@@ -7,13 +7,13 @@ import os
 import shutil
 import uuid
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import shapely
 
@@ -23,6 +23,7 @@ from geofleet.tables.schemas import BBOX, BBOX_TYPE, GEOMETRY, SCHEMAS, Schema
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    import pyarrow.dataset as ds
     from geopandas import GeoDataFrame
     from numpy.typing import NDArray
 
@@ -112,21 +113,51 @@ def write_table(schema: Schema, table: pa.Table, path: Path) -> None:
         pq.write_table(table.replace_schema_metadata(geo_metadata(schema, table)), draft, compression=_COMPRESSION)
 
 
+def write_pieces(schema: Schema, pieces: Iterator[pa.Table], path: Path) -> int:
+    """Write tables one after the other into one file, a row group each, and return the number of rows.
+
+    Each piece is sorted by key and all of it before the next; only one at a time is held. A single piece gives the
+    bytes of `write_table`.
+    """
+    first = next(pieces)
+    second = next(pieces, None)
+    if second is None:
+        write_table(schema, first, path)
+        return int(first.num_rows)
+    n_rows = 0
+    extents = []
+    plain = first.schema.with_metadata({b"geofleet:table": schema.name.encode()})
+    with atomic_path(path) as draft, pq.ParquetWriter(draft, plain, compression=_COMPRESSION) as writer:
+        for piece in chain((first, second), pieces):
+            first = second = None  # what is written need not be held
+            writer.write_table(piece.replace_schema_metadata(plain.metadata))
+            n_rows += piece.num_rows
+            extents += [extent] if (extent := _extent(piece)) else []
+        if schema.geometry:
+            low, high = np.min(extents, axis=0), np.max(extents, axis=0)
+            geo = _geo(schema, [*low[:2].tolist(), *high[2:].tolist()])
+            writer.add_key_value_metadata({"geo": geo.decode()})
+    return n_rows
+
+
 def geo_metadata(schema: Schema, table: pa.Table) -> dict[bytes, bytes]:
     """Return the file metadata: `geo` of GeoParquet 1.1 (OGC:CRS84 by default) and the name of the table."""
     metadata = {b"geofleet:table": schema.name.encode()}
     if schema.geometry:
-        column: dict[str, Any] = {
-            "encoding": "WKB",
-            "geometry_types": [schema.geometry],
-            "covering": {"bbox": {side: [BBOX, side] for side in ("xmin", "ymin", "xmax", "ymax")}},
-        }
-        extent = _extent(table)
-        if extent:
-            column["bbox"] = extent
-        geo = {"version": "1.1.0", "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
-        metadata[b"geo"] = json.dumps(geo, sort_keys=True).encode()
+        metadata[b"geo"] = _geo(schema, _extent(table))
     return metadata
+
+
+def _geo(schema: Schema, extent: list[float]) -> bytes:
+    column: dict[str, Any] = {
+        "encoding": "WKB",
+        "geometry_types": [schema.geometry],
+        "covering": {"bbox": {side: [BBOX, side] for side in ("xmin", "ymin", "xmax", "ymax")}},
+    }
+    if extent:
+        column["bbox"] = extent
+    geo = {"version": "1.1.0", "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
+    return json.dumps(geo, sort_keys=True).encode()
 
 
 def read_table(schema: Schema, path: Path, columns: Sequence[str] | None = None) -> pa.Table:
@@ -289,6 +320,8 @@ def _extent(table: pa.Table) -> list[float]:
 
 
 def _open(schema: Schema, path: Path) -> ds.Dataset:
+    import pyarrow.dataset as ds  # noqa: PLC0415  (takes 50 MB, which writing does without)
+
     if not path.exists():
         raise InputError("there is no such file.", where=str(path), todo="Check the path.")
     partitioning = ds.partitioning(pa.schema([(name, pa.string()) for name in schema.partitions]), flavor="hive")
