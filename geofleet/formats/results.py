@@ -66,12 +66,12 @@ def write_result_layers(
     labelled = _label(fused, labels)
     ellipses = _ellipses(labelled)
     frames = {
-        "scores": to_geodataframe(tiles),
+        "scores": _frame(tiles),
         "ellipses": ellipses,
         "match_lines": _match_lines(matches, labelled),
-        "reference": to_geodataframe(reference),
-        "fused": to_geodataframe(fused),
-        "matches": to_geodataframe(matches),
+        "reference": _frame(reference),
+        "fused": _frame(fused),
+        "matches": _frame(matches),
     }
     styles = {name: STYLES[name].qml() for name in frames}
     for name, frame in frames.items():
@@ -90,6 +90,17 @@ def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         writer = csv.DictWriter(stream, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
+
+
+def _frame(table: pa.Table) -> GeoDataFrame:
+    """Return a table as a frame in which a flag or whole number stays one beside nulls, not text or a fraction."""
+    frame = to_geodataframe(table)
+    for field in table.schema:
+        if pa.types.is_boolean(field.type):
+            frame[field.name] = frame[field.name].astype("boolean")
+        elif pa.types.is_integer(field.type):
+            frame[field.name] = frame[field.name].astype("Int64")
+    return frame
 
 
 def _label(fused: pa.Table, labels: pa.Table) -> pa.Table:

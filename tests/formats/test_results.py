@@ -76,6 +76,7 @@ def out(tmp_path_factory, make_signs):
         var_n_m2=[1.0, 1.0, 0.25, None, 1.0],
         cov_en_m2=[1.0, 0.0, 0.0, None, 0.0],
         height_m=[2.5, None, None, None, None],
+        n_passes=[7, None, None, None, None],
     )
     reference = make_signs([(0, 0), (40, 20), (80, 60), (120, 0)], ["stop"] * 4)
     write_table(SIGNS, map_, folder / "map.parquet")
@@ -130,7 +131,10 @@ def test_nulls_stay_nulls(out):
     assert by_id["s3"]["var_e_m2"] is None
     assert by_id["s0"]["height_m"] == 2.5
     assert by_id["s1"]["height_m"] is None
+    assert (repr(by_id["s0"]["n_passes"]), by_id["s1"]["n_passes"]) == ("7", None)
     outcomes = [f["properties"] for f in json.loads((out / "matches.geojson").read_text())["features"]]
+    assert [p["class_agrees"] for p in outcomes if p["outcome"] == "TP"] == [True, True]
+    assert {p["class_agrees"] for p in outcomes if p["outcome"] != "TP"} == {None}
     assert all((p["distance_m"] is None) == (p["outcome"] != "TP") for p in outcomes)
 
 
