@@ -17,6 +17,9 @@ import numpy as np
 import pandas as pd
 
 from geofleet.errors import InputError
+from geofleet.formats.drive_epochs import Epochs
+from geofleet.formats.gnss_time import gps_week_time, gpst_to_utc, microseconds
+from geofleet.formats.reading import refuse_long_lines
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,62 +30,14 @@ if TYPE_CHECKING:
 
 QUALITY = {1: "fixed", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 DERIVED = "derived"
-GPS_EPOCH = np.datetime64("1980-01-06", "us")
-WEEK_S = 604_800.0
-ROLLOVER_WEEKS = 1024
-_RECENT_WEEKS = 2048  # the count of ten bits began again on 2019-04-07
 _JST_S = 9 * 3600.0
-_LONGEST_S = 1e11  # three thousand years; what is longer is no time
 _N_COLUMNS = 32
 _MAX_LAT, _MAX_LON = 90.0, 180.0
-
-# Days on which GPS time came to be one more second ahead of UTC (IERS Bulletin C)
-LEAP_DAYS = np.array(
-    [
-        *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01"),
-        *("1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01", "1999-01-01", "2006-01-01"),
-        *("2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01"),
-    ],
-    "datetime64[us]",
-)
-_LEAPS_IN_GPST = LEAP_DAYS + np.arange(1, len(LEAP_DAYS) + 1).astype("timedelta64[s]")
 
 _DATED = re.compile(rb"\s*\d{4}/\d{1,2}/\d{1,2}[\s,;]+\d{1,2}:\d{2}:\d")
 _WEEKLY = re.compile(rb"\s*\d{1,4}[\s,;]+\d{1,6}\.\d+[\s,;]+-?\d{1,3}\.\d+[\s,;]+-?\d{1,3}\.\d+[\s,;]")
 _HEADER_MARKS = (b"RTKLIB", b"RTKPOST", b"% program", b"Q=1:fix", b"latitude", b"-ecef(m)", b"-baseline(m)")
 _HEADER_DATE = re.compile(r"(?:obs|sol) start\s*:\s*(\d{4}/\d{2}/\d{2})")
-
-
-@dataclass(frozen=True, slots=True)
-class Epochs:
-    """Epochs of a solution, all of shape (n,): UTC in microseconds, degrees, metres, name of the quality.
-
-    Standard deviations and heights that the file does not declare are NaN.
-    """
-
-    t_utc: NDArray[np.datetime64]
-    lon: Floats
-    lat: Floats
-    height_m: Floats
-    quality: NDArray[np.object_]
-    sigma_e_m: Floats
-    sigma_n_m: Floats
-
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Epochs:
-        """Return some of the epochs."""
-        return Epochs(
-            self.t_utc[rows],
-            self.lon[rows],
-            self.lat[rows],
-            self.height_m[rows],
-            self.quality[rows],
-            self.sigma_e_m[rows],
-            self.sigma_n_m[rows],
-        )
-
-    def seconds(self) -> Floats:
-        """Return seconds since the first epoch of the arrays."""
-        return np.asarray((self.t_utc - self.t_utc[0]) / np.timedelta64(1, "s"), np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +74,7 @@ def read_epochs(path: Path) -> tuple[Epochs, dict[str, int]]:
     InputError
         The solution is a baseline or Earth-centred, or holds no epoch with a position.
     """
+    refuse_long_lines(path)
     text = path.read_bytes().decode("utf-8", errors="replace")
     header = _header([line for line in text.splitlines() if line.startswith("%")])
     _refuse(header, path)
@@ -153,12 +109,6 @@ def read_epochs(path: Path) -> tuple[Epochs, dict[str, int]]:
         "epochs without a valid position": int((readable & ~placed).sum()),
     }
     return epochs.take(placed), skipped
-
-
-def gpst_to_utc(t_gpst: NDArray[np.datetime64]) -> NDArray[np.datetime64]:
-    """Take the leap seconds of its day off each GPS time."""
-    leaps = np.searchsorted(_LEAPS_IN_GPST, t_gpst, side="right")
-    return np.asarray(t_gpst - leaps.astype("timedelta64[s]"))
 
 
 def _header(lines: list[str]) -> _Header:
@@ -242,27 +192,12 @@ def _times(frame: pd.DataFrame, header: _Header) -> NDArray[np.datetime64]:
     days = pd.to_datetime(frame[0].where(dated), format="%Y/%m/%d", errors="coerce").to_numpy("datetime64[us]")
     clock = frame[1].where(dated).str.extract(r"^(\d{1,2}):(\d{2}):(\d{1,2}(?:\.\d*)?)$")
     hours, minutes, seconds = (pd.to_numeric(clock[i], errors="coerce").to_numpy(np.float64) for i in range(3))
-    of_day = days + _microseconds(hours * 3600.0 + minutes * 60.0 + seconds)
+    of_day = days + microseconds(hours * 3600.0 + minutes * 60.0 + seconds)
     week = np.where(dated, np.nan, _numbers(frame, 0))
-    week = week + _rollovers(week, header) * ROLLOVER_WEEKS
-    of_week = GPS_EPOCH + _microseconds(week * WEEK_S) + _microseconds(np.where(dated, np.nan, _numbers(frame, 1)))
+    of_week = gps_week_time(week, np.where(dated, np.nan, _numbers(frame, 1)), near=header.start)
     time = np.where(dated, of_day, of_week)
     if header.system == "UTC":
         return np.asarray(time)
     if header.system == "JST":
-        return np.asarray(time - _microseconds(np.array(_JST_S)))
+        return np.asarray(time - microseconds(np.array(_JST_S)))
     return gpst_to_utc(time)
-
-
-def _rollovers(week: Floats, header: _Header) -> Floats:
-    """Return how often ten bits of week count began again: by the date in the header, else since 2019."""
-    if not np.nanmin(week, initial=np.inf) < ROLLOVER_WEEKS:
-        return np.zeros(len(week))
-    known = _RECENT_WEEKS if header.start is None else (header.start - GPS_EPOCH) / np.timedelta64(7, "D")
-    return np.where(week < ROLLOVER_WEEKS, np.floor((known - week) / ROLLOVER_WEEKS + 0.5), 0.0)
-
-
-def _microseconds(seconds: Floats) -> NDArray[np.timedelta64]:
-    usable = np.abs(seconds) < _LONGEST_S
-    span = np.round(np.where(usable, seconds, 0.0) * 1e6).astype("timedelta64[us]")
-    return np.where(usable, span, np.timedelta64("NaT", "us"))

@@ -5,10 +5,13 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+from pyproj import Geod
 
+from geofleet.algorithms.geodesy import to_ecef
 from geofleet.errors import InputError
-from geofleet.formats.drives import jumps, motion_of, read_drive
-from geofleet.formats.rtklib import LEAP_DAYS, gpst_to_utc
+from geofleet.formats.drive_quality import motion_of
+from geofleet.formats.drives import read_drive
+from geofleet.formats.gnss_time import LEAP_DAYS, gpst_to_utc
 from geofleet.tables.store import lonlat
 
 TITLE = "%  {}                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)\n"
@@ -34,8 +37,8 @@ def first_time(path):
     ("name", "n", "quality", "gaps"),
     [
         ("nagoya/reference_1Hz.pos", 1231, {"fixed"}, 0),
-        ("nagoya/rover_rtk.pos", 5393, {"fixed", "float"}, 13),
-        ("nagoya/rover_1Hz_spp.pos", 542, {"single"}, None),
+        ("nagoya/rover_rtk.pos", 5395, {"fixed", "float"}, 15),
+        ("nagoya/rover_1Hz_spp.pos", 550, {"single"}, 26),
         ("nagoya/static_rover_rtk.pos", 301, {"fixed"}, 0),
         ("colorado/demo5_b34f_f.pos", 4521, {"fixed", "float"}, 0),
         ("colorado/gnss_1934_sf.pos", 2197, {"fixed", "float"}, 0),
@@ -43,10 +46,10 @@ def first_time(path):
 )
 def test_real_solutions(shared_data, name, n, quality, gaps):
     layer = read_drive(shared_data / "trajectory" / name)
-    assert layer.table.num_rows == n
+    assert layer.table.num_rows + sum(layer.skipped.values()) == n
     assert set(layer.table["fix_quality"].to_pylist()) == quality
-    assert gaps is None or layer.found["gaps"] == gaps
-    assert layer.table["seq"].to_pylist() == list(range(n))
+    assert layer.found["gaps"] == gaps
+    assert layer.table["seq"].to_pylist() == list(range(layer.table.num_rows))
 
 
 def test_two_headers_of_one_drive_give_one_time(shared_data):
@@ -56,15 +59,34 @@ def test_two_headers_of_one_drive_give_one_time(shared_data):
 
 
 def test_the_length_of_a_real_drive(shared_data):
-    table = read_drive(shared_data / "trajectory" / "nagoya" / "reference_1Hz.pos").table
-    speed = np.array(table["speed_mps"].to_pylist())
-    assert speed.sum() == pytest.approx(4180, rel=0.01)
+    layer = read_drive(shared_data / "trajectory" / "nagoya" / "reference_1Hz.pos")
+    lon, lat = lonlat(layer.table)
+    assert np.linalg.norm(np.diff(to_ecef(lon, lat), axis=0), axis=1).sum() == pytest.approx(4180, rel=0.01)
+    assert layer.found["epochs standing still"] / 1231 == pytest.approx(0.45, abs=0.01)
 
 
-def test_a_parked_car_has_no_heading(shared_data):
+def test_a_parked_car_is_one_stop_and_has_no_heading(shared_data):
     layer = read_drive(shared_data / "trajectory" / "nagoya" / "static_rover_rtk.pos")
-    assert layer.table["heading_deg"].null_count == 301
+    assert layer.table["heading_deg"].null_count == 2
     assert layer.found["epochs standing still"] == 301
+    assert layer.skipped == {"epochs inside of a stop": 299}
+
+
+@pytest.mark.parametrize(("name", "n"), [("helsinki_derived", 1284), ("helsinki_derived_b", 1359)])
+def test_a_clean_drive_comes_through_quality_control_untouched(repo, name, n):
+    layer = read_drive(repo / "data" / "raw" / f"{name}.pos")
+    assert layer.table.num_rows == n
+    assert layer.skipped == {}
+    assert not any(layer.found.values())
+    lines = (repo / "data" / "raw" / f"{name}.pos").read_text(encoding="utf-8").splitlines()
+    fields = np.array([line.split()[2:4] for line in lines if not line.startswith("%")], float)
+    np.testing.assert_array_equal(np.column_stack(lonlat(layer.table)[::-1]), fields)
+    # heading and speed as plain central differences on the ellipsoid give them
+    lat, lon = fields.T
+    azimuth, _, distance_m = Geod(ellps="WGS84").inv(lon[:-2], lat[:-2], lon[2:], lat[2:])
+    np.testing.assert_array_equal(layer.table["heading_deg"].to_numpy()[1:-1], np.asarray(azimuth) % 360)
+    np.testing.assert_allclose(layer.table["speed_mps"].to_numpy()[1:-1], np.asarray(distance_m) / 0.2, rtol=1e-12)
+    assert set(layer.table["segment"].to_pylist()) == {0}
 
 
 def test_a_baseline_solution_is_refused_with_the_reason(shared_data):
@@ -155,21 +177,12 @@ def test_motion_of_one_epoch_is_unknown(tmp_path):
     assert (row["heading_deg"], row["speed_mps"], row["segment"]) == (None, None, 0)
 
 
-def test_a_single_wrong_fix_is_a_jump_and_a_curve_is_not():
-    t = np.arange(20.0) / 5
-    lat = 50.0 + t * 1e-4
-    lon = 10.0 + np.sin(t) * 1e-5
-    assert not jumps(t, lon, lat).any()
-    lon[10] += 41.8 / 71_000
-    assert np.flatnonzero(jumps(t, lon, lat)).tolist() == [10]
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (b"", "the file is empty"),
-        (b"hello\n", "not an RTKLIB solution"),
-        (b"lat,lon\n50,10\n", "not an RTKLIB solution"),
+        (b"hello\n", "not a trajectory in a format"),
+        (b"lat,lon\n50,10\n", "not a trajectory in a format"),
         (b"% program   : RTKLIB\n", "holds no epoch"),
         (b"% program   : RTKLIB\n1 2 3\n", "holds no epoch"),
     ],

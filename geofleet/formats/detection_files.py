@@ -1,0 +1,177 @@
+"""Rows of detections from CSV, Parquet and GeoJSON, a batch at a time: memory does not grow with CSV and Parquet."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import json
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import shapely
+
+from geofleet.errors import InputError
+from geofleet.formats.inventory_files import CRS84, detect, read_features
+from geofleet.formats.reading import read_head, refuse_long_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+BATCH_ROWS = 100_000
+_BLOCK_BYTES = 8 << 20
+_SAMPLE_BYTES = 1 << 20
+_DELIMITERS = ",;\t|"
+_GEOMETRY_NAMES = ("geometry", "geom", "wkb_geometry")
+_TODO = "Fetch or export it again."
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Some rows of a file.
+
+    Parameters
+    ----------
+    table
+        Attributes, without the geometry.
+    geometry
+        Geometries, None where there is none, shape (n,); None for plain rows.
+    crs
+        As pyproj takes it; None when the file does not say.
+    first_row
+        Number of the first row, counted from 1 in the file.
+    broken
+        Number and text of lines that have more or fewer fields than the header.
+    """
+
+    table: pa.Table
+    geometry: NDArray[np.object_] | None
+    crs: Any
+    first_row: int
+    broken: tuple[tuple[int, str], ...] = field(default=())
+
+
+def read_batches(path: Path) -> Iterator[Batch]:
+    """Yield the rows of a file.
+
+    Raises
+    ------
+    InputError
+        The file is missing, empty, damaged or of another format.
+    """
+    found = detect(read_head(path))
+    readers = {"csv": _csv_batches, "parquet": _parquet_batches, "geojson": _feature_batches}
+    readers["geojsonseq"] = _feature_batches
+    if found not in readers:
+        raise InputError(
+            "no format of detections.",
+            where=str(path),
+            todo="Give CSV, GeoJSON or (Geo)Parquet, with a position a row.",
+        )
+    try:
+        yield from readers[found](path)
+    except (pa.ArrowException, OSError, ValueError, KeyError, shapely.GEOSException) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"damaged or not {found} ({reason[:300]}).", where=str(path), todo=_TODO) from None
+
+
+def _csv_batches(path: Path) -> Iterator[Batch]:
+    from pyarrow import csv as arrow_csv  # noqa: PLC0415  (only CSV needs it)
+
+    refuse_long_lines(path)
+    encoding = _encoding(path)
+    names, delimiter = _header(path, encoding)
+    broken: list[tuple[int, str]] = []
+
+    def keep(row: Any) -> str:
+        broken.append((int(row.number or 0) - 1, str(row.text)[:1000]))
+        return "skip"
+
+    # Text, all of it: as numbers 274.10 and 0205 would lose what tells them apart
+    reader = arrow_csv.open_csv(
+        path,
+        read_options=arrow_csv.ReadOptions(encoding=encoding, block_size=_BLOCK_BYTES, use_threads=False),
+        parse_options=arrow_csv.ParseOptions(delimiter=delimiter, invalid_row_handler=keep),
+        convert_options=arrow_csv.ConvertOptions(column_types=dict.fromkeys(names, pa.string())),
+    )
+    first = 1
+    for block in reader:
+        lost, broken[:] = tuple(broken), []
+        yield Batch(pa.Table.from_batches([block]), None, None, first, lost)
+        first += block.num_rows + len(lost)
+    if broken:
+        yield Batch(reader.schema.empty_table(), None, None, first, tuple(broken))
+
+
+def _parquet_batches(path: Path) -> Iterator[Batch]:
+    import pyarrow.parquet as pq  # noqa: PLC0415  (only Parquet needs it)
+
+    with pq.ParquetFile(path) as file:
+        name, crs, dropped = _geometry_of(file.schema_arrow)
+        first = 1
+        for block in file.iter_batches(batch_size=BATCH_ROWS, use_threads=False):
+            table = pa.Table.from_batches([block]).replace_schema_metadata(None)
+            geometry = None
+            if name:
+                wkb = table[name].cast(pa.binary()).to_numpy(zero_copy_only=False)
+                geometry = np.asarray(shapely.from_wkb(wkb, on_invalid="ignore"), object)
+            yield Batch(table.drop_columns(dropped), geometry, crs, first)
+            first += block.num_rows
+
+
+def _geometry_of(schema: pa.Schema) -> tuple[str, Any, list[str]]:
+    """Return the column of WKB and its CRS, and what columns hold geometry and bounding boxes."""
+    raw = (schema.metadata or {}).get(b"geo")
+    if raw is None:
+        found = [n for n in _GEOMETRY_NAMES if n in schema.names and pa.types.is_binary(schema.field(n).type)]
+        return (found[0] if found else ""), None, found[:1]
+    geo = json.loads(raw)
+    name = geo["primary_column"]
+    about = geo["columns"][name]
+    if about["encoding"] != "WKB":
+        raise ValueError(f"geometries are encoded as {about['encoding']}, not as WKB")
+    crs = about.get("crs", CRS84)  # absent means CRS84, null means unknown
+    if isinstance(crs, dict):
+        from pyproj import CRS  # noqa: PLC0415  (takes a moment to load)
+
+        crs = CRS.from_json_dict(crs).to_wkt()
+    covering = [side[0] for side in about.get("covering", {}).get("bbox", {}).values()]
+    return name, crs, [n for n in dict.fromkeys([*geo["columns"], *covering]) if n in schema.names]
+
+
+def _feature_batches(path: Path) -> Iterator[Batch]:
+    features = read_features(path)
+    for first in range(0, features.table.num_rows, BATCH_ROWS):
+        shapes = None if features.geometry is None else features.geometry[first : first + BATCH_ROWS]
+        yield Batch(features.table.slice(first, BATCH_ROWS), shapes, features.crs, first + 1)
+
+
+def _encoding(path: Path) -> str:
+    """Return UTF-16 by its mark, UTF-8 when the first mebibyte is, else Windows-1252."""
+    with path.open("rb") as file:
+        sample = file.read(_SAMPLE_BYTES)
+    if sample.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(sample)
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8"
+
+
+def _header(path: Path, encoding: str) -> tuple[list[str], str]:
+    """Return the column names and what stands between them."""
+    with path.open(encoding="utf-8-sig" if encoding == "utf-8" else encoding) as file:
+        line = file.readline(_SAMPLE_BYTES)
+    delimiter = max(_DELIMITERS, key=line.count)
+    names = next(csv.reader([line], delimiter=delimiter), [])
+    if len(names) < 2:  # noqa: PLR2004  (a class needs a position)
+        raise InputError("the first line names no columns.", where=str(path), todo="Give a CSV file with a header.")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"columns {', '.join(twice)[:200]} are there twice.", where=str(path), todo="Rename them.")
+    return names, delimiter

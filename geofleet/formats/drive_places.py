@@ -1,0 +1,82 @@
+"""Coordinates of a trajectory as degrees: geographic, projected, Earth-centred, or metres from an origin in UTM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from geofleet.errors import ConfigError
+from geofleet.formats.positions import to_lonlat
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+_MAX_UTM_LAT_DEG, _MAX_LON_DEG = 84.0, 180.0
+_LEAST_RADIUS_M = 6_300_000.0  # the poles lie 6 357 km from the centre
+
+
+@dataclass(frozen=True, slots=True)
+class LocalCrs:
+    """A CRS, and easting and northing of x = y = 0 in it."""
+
+    crs: str
+    easting_m: float = 0.0
+    northing_m: float = 0.0
+
+
+def local_crs(crs: str | None, origin: tuple[float, float] | None, utm: tuple[str, float, float] | None) -> LocalCrs:
+    """Return the CRS that a caller means: one by name, metres from an origin in its UTM zone, or a shifted one.
+
+    Raises
+    ------
+    ConfigError
+        Two are given, or the origin lies outside of UTM.
+    """
+    if (crs is not None) + (origin is not None) + (utm is not None) > 1:
+        raise ConfigError("crs, origin and utm contradict each other.", todo="Give one of them.")
+    if utm is not None:
+        return LocalCrs(utm[0], float(utm[1]), float(utm[2]))
+    if origin is None:
+        return LocalCrs(crs or "OGC:CRS84")
+    from pyproj import Transformer  # noqa: PLC0415  (only local coordinates need it)
+
+    lat, lon = origin
+    if not (abs(lat) <= _MAX_UTM_LAT_DEG and abs(lon) <= _MAX_LON_DEG):
+        raise ConfigError(
+            f"the origin {lat:g},{lon:g} lies outside of UTM.", todo="Give LAT,LON in degrees, latitude first."
+        )
+    zone = min(int((lon + 180.0) // 6.0) + 1, 60)
+    name = f"EPSG:{(32600 if lat >= 0 else 32700) + zone}"
+    easting, northing = Transformer.from_crs("OGC:CRS84", name, always_xy=True).transform(lon, lat)
+    return LocalCrs(name, float(easting), float(northing))
+
+
+def to_places(x: Floats, y: Floats, z: Floats, local: LocalCrs, *, where: str) -> tuple[Floats, Floats, Floats]:
+    """Return longitude and latitude in degrees and height in metres; NaN where there is no such place.
+
+    Raises
+    ------
+    InputError
+        The CRS is unknown or contradicts the numbers.
+    """
+    from pyproj import CRS, Transformer  # noqa: PLC0415  (takes a moment to load)
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
+    try:
+        known = CRS.from_user_input(local.crs)
+    except CRSError:
+        raise ConfigError(f"unknown CRS {local.crs[:80]!r}.", todo="Give one such as EPSG:32617.") from None
+    if not known.is_geocentric:
+        return *to_lonlat(x + local.easting_m, y + local.northing_m, known, where=where), z
+    if not np.isfinite(z).any():
+        raise ConfigError(f"{known.name} needs a third coordinate.", where=where, todo="Name it: height=….")
+    radius = np.sqrt(x**2 + y**2 + z**2)
+    on_earth = np.isfinite(radius) & (radius > _LEAST_RADIUS_M)
+    x, y, z = (np.where(on_earth, side, np.nan) for side in (x, y, z))
+    lon, lat, height = Transformer.from_crs(known, "EPSG:4979", always_xy=True).transform(x, y, z)
+    lon, lat, height = (np.where(np.isfinite(side), side, np.nan) for side in (lon, lat, height))
+    return lon, lat, height
