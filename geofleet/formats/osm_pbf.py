@@ -11,6 +11,7 @@ format allows raises `UnusualPbfError`; libosmium can rewrite such a file.
 from __future__ import annotations
 
 import zlib
+from bisect import bisect_right
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     Ints = NDArray[np.int64]
 
-__all__ = ["Block", "DenseNodes", "UnusualPbfError", "deltas", "read_blocks", "varints"]
+__all__ = ["Block", "DenseNodes", "Strings", "UnusualPbfError", "deltas", "read_blocks", "varints"]
 
 _MAX_HEADER_BYTES = 64 * 1024
 _MAX_BLOB_BYTES = 32 * 1024 * 1024
@@ -68,6 +69,47 @@ class DenseNodes:
     keys_vals: Ints
 
 
+@dataclass(frozen=True, slots=True)
+class Strings:
+    """A string table: where each string's field begins, and the end of the last one; strings are cut when asked for."""
+
+    data: bytes
+    start: list[int]
+
+    @classmethod
+    def of(cls, data: bytes, span: Span) -> Strings:
+        """Find the strings of a table."""
+        at, end = span
+        start = []
+        while at < end:
+            start.append(at)
+            size = data[at + 1]
+            if size < 0x80:  # noqa: PLR2004 - the top bit says that more bytes follow
+                at += size + 2
+            else:
+                size, at = _varint(data, at + 1)
+                at += size
+        if at != end or any(data[at] != 0x0A for at in start):  # noqa: PLR2004 - field 1, bytes
+            raise DamagedPbfError("a string table with something else in it")
+        return cls(data, [*start, at])
+
+    def __len__(self) -> int:
+        return len(self.start) - 1
+
+    def __getitem__(self, index: int) -> bytes:
+        at, end = self.start[index], self.start[index + 1]
+        return self.data[at + 2 : end] if self.data[at + 1] < 0x80 else self.data[_varint(self.data, at + 1)[1] : end]  # noqa: PLR2004 - as above
+
+    def numbers(self, field: bytes, *, whole: bool) -> Iterator[int]:
+        """Yield the numbers of the strings whose field has these bytes somewhere after its head, or is these bytes."""
+        at = self.data.find(field, self.start[0], self.start[-1])
+        while at >= 0:
+            index = bisect_right(self.start, at) - 1
+            if not whole or self.start[index] == at:
+                yield index
+            at = self.data.find(field, self.start[index + 1], self.start[-1])
+
+
 @dataclass(frozen=True)
 class Block:
     """A block of a file, unpacked and not yet decoded."""
@@ -92,10 +134,10 @@ class Block:
         start, end = self._parts[0]
         return self.data.find(text, start, end) >= 0
 
-    @property
-    def strings(self) -> list[bytes]:
+    @cached_property
+    def strings(self) -> Strings:
         """The string table."""
-        return strings_of(self.data, self._parts[0])
+        return Strings.of(self.data, self._parts[0])
 
     def dense_nodes(self, *, tagged: bool = True) -> Iterator[DenseNodes]:
         """Yield the nodes of each group; without tags when they are not asked for.
@@ -150,24 +192,6 @@ class Block:
             raise DamagedPbfError("ids and positions differ in number")
         lat_e7, lon_e7 = (_e7(numbers[offset] + numbers[17] * side) for offset, side in ((19, lat), (20, lon)))
         return DenseNodes(node_id, lon_e7, lat_e7, varints(packed[10]) if tagged else np.zeros(0, np.int64))
-
-
-def strings_of(data: bytes, span: Span) -> list[bytes]:
-    """Return the strings of a string table, in order."""
-    found = []
-    at, end = span
-    while at < end:
-        if data[at] != 0x0A:  # noqa: PLR2004 - field 1, bytes
-            raise DamagedPbfError("a string table with something else in it")
-        size = data[at + 1]
-        at += 2
-        if size >= 0x80:  # noqa: PLR2004 - more bytes follow
-            size, at = _varint(data, at - 1)
-        found.append(data[at : at + size])
-        at += size
-    if at != end:
-        raise DamagedPbfError("a string table beyond its end")
-    return found
 
 
 def varints(packed: bytes) -> Ints:

@@ -18,7 +18,7 @@ import shapely
 
 from geofleet.formats.osm_tags import is_sign_key, node_signs
 from geofleet.tables.schemas import SIGNS
-from geofleet.tables.store import build_table
+from geofleet.tables.store import arrow_numbers, arrow_texts, build_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,8 +34,10 @@ if TYPE_CHECKING:
 
 _MAPPED_TWICE_M = 25.0
 _DEGREE_M = 111_195.0
-_ROWS_A_PIECE = 1 << 15
+_ROWS_A_PIECE = 1 << 14
 _DIGITS = 19
+_E7 = 1e7
+_HYPHEN, _NOTHING = arrow_texts(["-", ""])
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class SignRows:
     def of(cls, nodes: SignNodes, *, source: str) -> SignRows:
         """Work out what every set of tags says."""
         said = [sorted(enumerate(node_signs(tags)), key=lambda sign: str(sign[0])) for tags in nodes.tagsets]
-        return cls(nodes.take(_text_order(nodes.node_id)), source, said)
+        return cls(nodes, source, said)
 
     @cached_property
     def n_signs(self) -> Ints:
@@ -129,16 +131,18 @@ class SignRows:
 
     @cached_property
     def _columns(self) -> dict[str, pa.Array]:
-        """Columns that the tags alone decide, a row a sign of `_flat`."""
+        """Columns that the tags alone decide, a row a sign of `_flat`; of ids the place among the node's signs."""
         signs = [sign for _, sign in self._flat]
         columns: dict[str, list[Any]] = {
             name: [getattr(sign, name) for sign in signs] for name in ("kind", "raw_code", "country")
         }
+        columns["sign_id"] = [str(place) for place, _ in self._flat]
+        columns["parent_id"] = [None if sign.parent is None else str(sign.parent) for sign in signs]
         columns |= {
             name: [getattr(sign.meaning, name) for sign in signs] for name in ("concept", "value", "unit", "sign_class")
         }
-        types = {column.name: column.type for column in SIGNS.all_columns}
-        return {name: pa.array(column, types[name]) for name, column in columns.items()}
+        value = np.array([np.nan if v is None else v for v in columns.pop("value")], np.float64)
+        return {"value": arrow_numbers(value)} | {name: arrow_texts(column) for name, column in columns.items()}
 
     def _templates(self, first: int, last: int) -> tuple[Ints, Ints]:
         """Return the node and the place in `_flat` of each row of some nodes."""
@@ -149,21 +153,20 @@ class SignRows:
 
     def _piece(self, first: int, last: int, first_row: int) -> pa.Table:
         node, template = self._templates(first, last)
-        rows = pa.array(template)
-        place = pa.array([str(place) for place, _ in self._flat], pa.string()).take(rows)
-        parent = pa.array([None if s.parent is None else str(s.parent) for _, s in self._flat], pa.string()).take(rows)
-        number = pa.array(self.nodes.node_id[node]).cast(pa.string())
-        support = pc.binary_join_element_wise("n", number, "")
-        columns = {name: column.take(rows) for name, column in self._columns.items()} | {
-            "sign_id": pc.binary_join_element_wise(support, place, "-"),
-            "parent_id": pc.binary_join_element_wise(support, parent, "-"),
+        rows = arrow_numbers(template)
+        number = arrow_numbers(self.nodes.node_id[node]).cast(pa.string())
+        support = _headed("n", number)
+        taken = {name: column.take(rows) for name, column in self._columns.items()}
+        columns = taken | {
+            "sign_id": pc.binary_join_element_wise(support, taken["sign_id"], _HYPHEN),
+            "parent_id": pc.binary_join_element_wise(support, taken["parent_id"], _HYPHEN),
             "facing_deg": self._facing(template, first_row),
             "support_id": support,
             "road_id": self._road_id(node),
             "source": self.source,
-            "source_ref": pc.binary_join_element_wise("node/", number, ""),
+            "source_ref": _headed("node/", number),
         }
-        return build_table(SIGNS, columns, (self.nodes.lon_e7[node] / 1e7, self.nodes.lat_e7[node] / 1e7))
+        return build_table(SIGNS, columns, (self.nodes.lon_e7[node] / _E7, self.nodes.lat_e7[node] / _E7))
 
     def _facing(self, template: Ints, first_row: int) -> Floats:
         if self.facing_deg is None:
@@ -176,24 +179,32 @@ class SignRows:
         run = self.near.run[node]
         if not len(self.road_ids):
             return pa.nulls(len(run), pa.string())
-        way = pa.array(self.road_ids[np.maximum(run, 0)], mask=run < 0).cast(pa.string())
-        return pc.binary_join_element_wise("w", way, "")
+        way = arrow_numbers(self.road_ids[np.maximum(run, 0)]).cast(pa.string())
+        return pc.if_else(pa.array(run >= 0), _headed("w", way), None)
+
+
+def _headed(head: str, texts: pa.Array) -> pa.Array:
+    """Return texts with a head before each."""
+    return pc.binary_join_element_wise(arrow_texts([head])[0], texts, _NOTHING)
 
 
 def clean_nodes(nodes: SignNodes) -> tuple[SignNodes, dict[str, int]]:
-    """Leave out nodes nowhere on Earth, given twice, or mapped on the road as well as beside it; tell how many."""
+    """Leave out nodes nowhere on Earth, given before, or mapped on the road as well as beside it; tell how many.
+
+    The others come in the order of their ids as text.
+    """
     valid = nodes.is_valid
-    kept = nodes.take(valid)
-    _, first = np.unique(kept.node_id, return_index=True)
-    n_again = len(kept.node_id) - len(first)
-    kept = kept.take(np.sort(first)) if n_again else kept
+    kept = nodes if valid.all() else nodes.take(valid)
+    kept = kept.take(_text_order(kept.node_id))
+    again = np.diff(kept.node_id, prepend=kept.node_id[:1] - 1) == 0
+    kept = kept.take(~again) if again.any() else kept
     twice = _mapped_twice(kept)
     skipped = {
         "nodes without a valid position": int((~valid).sum()),
-        "nodes that came before": n_again,
+        "nodes that came before": int(again.sum()),
         f"highway=stop, give_way within {_MAPPED_TWICE_M:.0f} m of the sign itself": int(twice.sum()),
     }
-    return kept.take(~twice), {reason: n for reason, n in skipped.items() if n}
+    return kept.take(~twice) if twice.any() else kept, {reason: n for reason, n in skipped.items() if n}
 
 
 def _mapped_twice(nodes: SignNodes) -> NDArray[np.bool_]:

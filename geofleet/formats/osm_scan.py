@@ -16,7 +16,7 @@ import numpy as np
 
 from geofleet.errors import InputError
 from geofleet.formats import osm_json
-from geofleet.formats.osm_pbf import Block, DenseNodes, UnusualPbfError, deltas, read_blocks, varints
+from geofleet.formats.osm_pbf import Block, DenseNodes, Strings, UnusualPbfError, deltas, read_blocks, varints
 from geofleet.formats.osm_roads import Roads
 from geofleet.formats.osm_tags import (
     KEY_STARTS,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Ints = NDArray[np.int64]
-    Tagset = tuple[tuple[str, str], ...]
+    RawTags = tuple[bytes, ...]  # key and value in turn
 
 _PBF_MARK = b"OSMHeader"
 _MARK_WITHIN = 1024
@@ -45,9 +45,8 @@ _E7 = 1e7
 _MAX_E7 = (1_800_000_000, 900_000_000)
 _HIGHWAY = b"\n\x07highway"
 # What a block with signs has in its string table: a key, or a word of `highway` with its length before it.
-_MARKS = (b"traffic_sign", *(b"\n%c" % len(word) + word.encode() for word in POINT_HIGHWAYS))
-_KEY_STARTS = tuple(start.encode() for start in KEY_STARTS)
-_WORDS = frozenset(word.encode() for word in POINT_HIGHWAYS)
+_WORDS = tuple(b"\n%c" % len(word) + word.encode() for word in POINT_HIGHWAYS)
+_MARKS = (b"traffic_sign", *_WORDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +98,7 @@ class _Found:
 
     has_nodes: bool
     groups: list[tuple[Ints, Ints, Ints, list[int]]]
-    tagsets: list[Tagset]
+    tagsets: list[RawTags]
 
 
 def detect(head: bytes) -> str:
@@ -214,7 +213,7 @@ def sign_nodes(pbf: Path) -> SignNodes:
     InputError
         The file is damaged or holds no node at all.
     """
-    tagsets: dict[Tagset, int] = {}
+    tagsets: dict[RawTags, int] = {}
     columns: list[tuple[Ints, NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]] = []
     has_nodes = False
     for found in read_blocks(pbf, _signs_in, nodes_only=True):
@@ -226,7 +225,7 @@ def sign_nodes(pbf: Path) -> SignNodes:
         raise InputError("the file holds no nodes.", where=str(pbf), todo="Check that it is the extract you mean.")
     empty = (np.zeros(0, np.int64), *(np.zeros(0, np.int32) for _ in range(3)))
     node_id, lon32, lat32, tagset = (np.concatenate(column) for column in zip(empty, *columns, strict=True))
-    return SignNodes(node_id, lon32, lat32, tagset, [dict(tags) for tags in tagsets])
+    return SignNodes(node_id, lon32, lat32, tagset, [_tags(raw) for raw in tagsets])
 
 
 def _int32(e7: Ints) -> NDArray[np.int32]:
@@ -253,23 +252,20 @@ def _signs_in(block: Block) -> _Found:
         ends = (16 * np.cumsum(counts)).tolist()
         own = [tagsets.setdefault(packed[a:b], len(tagsets)) for a, b in zip([0, *ends], ends, strict=False)]
         groups.append((nodes.node_id[chosen], nodes.lon_e7[chosen], nodes.lat_e7[chosen], own))
-    return _Found(has_nodes, groups, [_tags(packed, strings) for packed in tagsets])
+    return _Found(has_nodes, groups, [_pairs(packed, strings) for packed in tagsets])
 
 
-def _roles(strings: list[bytes]) -> tuple[NDArray[np.int8], NDArray[np.bool_], int]:
+def _roles(strings: Strings) -> tuple[NDArray[np.int8], NDArray[np.bool_], int]:
     """Tell which strings are keys that tell of signs (1) or name them (2), which are signs' words, which is highway."""
     role = np.zeros(len(strings), np.int8)
     is_word = np.zeros(len(strings), bool)
-    highway = -1
-    for index, text in enumerate(strings):
-        if text.startswith(_KEY_STARTS):
-            key = text.decode(errors="replace")
+    for start in KEY_STARTS:
+        for index in strings.numbers(start.encode(), whole=False):
+            key = strings[index].decode(errors="replace")
             role[index] = 2 if is_sign_key(key) else tells_of_signs(key)
-            if text == b"highway":
-                highway = index
-        if text in _WORDS:
-            is_word[index] = True
-    return role, is_word, highway
+    for word in _WORDS:
+        is_word[list(strings.numbers(word, whole=True))] = True
+    return role, is_word, next(strings.numbers(_HIGHWAY, whole=True), -1)
 
 
 def _sign_tags(
@@ -295,10 +291,15 @@ def _sign_tags(
     return chosen, counts, np.column_stack((key[kept], value[kept]))
 
 
-def _tags(packed: bytes, strings: list[bytes]) -> Tagset:
-    pairs = np.frombuffer(packed, np.int64).reshape(-1, 2).tolist()
-    text = [(strings[key].decode(errors="replace"), strings[value].decode(errors="replace")) for key, value in pairs]
-    return tuple(sorted(text))
+def _pairs(packed: bytes, strings: Strings) -> RawTags:
+    """Return the strings of a packed list of tags."""
+    numbers = np.frombuffer(packed, np.int64).tolist()
+    return tuple([strings[number] for number in numbers])
+
+
+def _tags(raw: RawTags) -> dict[str, str]:
+    text = [part.decode(errors="replace") for part in raw]
+    return dict(sorted(zip(text[::2], text[1::2], strict=True)))
 
 
 def read_roads(pbf: Path) -> Roads:
@@ -364,9 +365,10 @@ def _ways_in(block: Block) -> list[_Way]:
     if not block.holds_string(_HIGHWAY):
         return []
     strings = block.strings
-    mark = _encoded(strings.index(b"highway")) if b"highway" in strings else None
-    if mark is None:
+    highway = next(strings.numbers(_HIGHWAY, whole=True), None)
+    if highway is None:
         return []
+    mark = _encoded(highway)
     found = []
     for way_id, keys, values, refs in block.ways(lambda packed: mark in packed):
         pairs = zip(varints(keys).tolist(), varints(values).tolist(), strict=True)
