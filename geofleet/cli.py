@@ -48,6 +48,12 @@ Columns = Annotated[
         "--columns", help="What columns mean: code=bord,facing=azimuth, or a TOML file.", metavar="NAME=COLUMN,..."
     ),
 ]
+SchemeOption = Annotated[
+    str | None, typer.Option("--scheme", help="Scheme of the codes: mapillary, osm, vienna, us ...")
+]
+CountryOption = Annotated[
+    str | None, typer.Option("--country", help="ISO 3166-1 alpha-2 of codes that do not name it.")
+]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="A TOML file of settings.")]
 Scenario = Annotated[str, typer.Option("--scenario", help="Name of a packaged scenario, or a TOML file.")]
@@ -83,8 +89,8 @@ def ingest_signs(
     origin: Origin = None,
     utm: Utm = None,
     columns: Columns = None,
-    scheme: Annotated[str | None, typer.Option(help="Scheme of the codes: mapillary, osm, vienna, us ...")] = None,
-    country: Annotated[str | None, typer.Option(help="ISO 3166-1 alpha-2 of codes that do not name it.")] = None,
+    scheme: SchemeOption = None,
+    country: CountryOption = None,
     roads: Annotated[bool, typer.Option("--roads/--no-roads", help="Infer facing and road from the ways.")] = True,
     as_json: AsJson = False,
 ) -> None:
@@ -131,7 +137,16 @@ def ingest_lanes(
 
 
 @ingest_app.command("drive")
-def ingest_drive(inputs: Inputs, out: Out, as_json: AsJson = False) -> None:
+def ingest_drive(
+    inputs: Inputs,
+    out: Out,
+    file_format: Annotated[str, typer.Option("--format", help="auto, rtklib, nmea, gpx or csv.")] = "auto",
+    columns: Columns = None,
+    crs: Crs = None,
+    origin: Origin = None,
+    utm: Utm = None,
+    as_json: AsJson = False,
+) -> None:
     """Read trajectories into a `drives` table.
 
     Example: geofleet ingest drive data/raw/helsinki_derived.pos --out drives.parquet
@@ -139,7 +154,47 @@ def ingest_drive(inputs: Inputs, out: Out, as_json: AsJson = False) -> None:
     from geofleet.steps import ingest
 
     with _progress("reading drives") as progress:
-        result = ingest.ingest_drive(inputs, out, progress=progress)
+        result = ingest.ingest_drive(
+            inputs,
+            out,
+            file_format=file_format,
+            columns=_columns(columns),
+            crs=crs,
+            origin=_origin(origin),
+            utm=_utm(utm),
+            progress=progress,
+        )
+    _report(result, as_json=as_json)
+
+
+@ingest_app.command("detections")
+def ingest_detections(
+    inputs: Inputs,
+    out: OutFolder,
+    columns: Columns = None,
+    crs: Crs = None,
+    scheme: SchemeOption = None,
+    country: CountryOption = None,
+    run_id: Annotated[str, typer.Option(help="Of rows that do not name one.")] = "fleet",
+    as_json: AsJson = False,
+) -> None:
+    """Read the detections of a real fleet into a `detections` table; bad rows go to <out>_rejected.parquet.
+
+    Example: geofleet ingest detections fleet.csv --columns x=lon,y=lat,code=sign --scheme mapillary --out detections
+    """
+    from geofleet.steps import ingest_detections as step
+
+    with _progress("reading detections") as progress:
+        result = step.ingest_detections(
+            inputs,
+            out,
+            columns=_columns(columns),
+            crs=crs,
+            scheme=scheme,
+            country=country,
+            run_id=run_id,
+            progress=progress,
+        )
     _report(result, as_json=as_json)
 
 
@@ -185,11 +240,15 @@ def aggregate(
     detections: Annotated[Path, typer.Option("--detections", help="A detections table or folder.")],
     out: Out,
     vehicles: Annotated[int | None, typer.Option("--vehicles", help="Use the first V vehicles only.")] = None,
-    method: Annotated[str | None, typer.Option(help="dbscan.")] = None,
+    method: Annotated[str | None, typer.Option(help="dbscan, hdbscan, kmeans or kmedoids.")] = None,
     semantic: Annotated[str | None, typer.Option(help="first or after.")] = None,
     eps_m: Annotated[float | None, typer.Option(help="Radius of a neighbourhood.")] = None,
     min_samples: Annotated[int | None, typer.Option(help="Detections that make a core.")] = None,
+    min_cluster_size: Annotated[int | None, typer.Option(help="Detections that make a cluster: hdbscan.")] = None,
+    k: Annotated[int | None, typer.Option("--k", help="Signs of a run: kmeans, kmedoids; 0 = chosen.")] = None,
+    k_from: Annotated[Path | None, typer.Option(help="Reference that tells K (an oracle): kmeans, kmedoids.")] = None,
     min_support: Annotated[int | None, typer.Option(help="Passes that a sign needs.")] = None,
+    passes: Annotated[Path | None, typer.Option(help="A passes table: support relative to who saw the place.")] = None,
     tile_zoom: Annotated[int | None, typer.Option(help="Size of the tiles; the result does not depend on it.")] = None,
     config: ConfigFile = None,
     scenario: Scenario = "paper",
@@ -210,12 +269,21 @@ def aggregate(
         semantic=semantic,
         eps_m=eps_m,
         min_samples=min_samples,
+        min_cluster_size=min_cluster_size,
+        k=k,
         min_support=min_support,
         tile_zoom=tile_zoom,
     )
     with _progress("aggregating") as progress:
         result = step.aggregate(
-            detections, out, config=settled, n_vehicles=vehicles, n_workers=workers, progress=progress
+            detections,
+            out,
+            config=settled,
+            n_vehicles=vehicles,
+            passes=passes,
+            k_from=k_from,
+            n_workers=workers,
+            progress=progress,
         )
     _report(result, as_json=as_json)
 
@@ -230,6 +298,8 @@ def evaluate(
     clip: Annotated[bool, typer.Option("--clip", help="Score only where both maps have signs.")] = False,
     clip_m: Annotated[float | None, typer.Option(help="With --clip: as near as this, 100 m if not given.")] = None,
     in_view: Annotated[bool, typer.Option("--in-view", help="Score only signs that a pass had in view.")] = False,
+    drive: Annotated[Path | None, typer.Option("--drive", help="Drives table: intervals go along it.")] = None,
+    versus: Annotated[Path | None, typer.Option("--versus", help="Another map: is the first one better?")] = None,
     require: Annotated[list[str] | None, typer.Option(help='Exit 1 when missed: "gospa_m<0.8".')] = None,
     config: ConfigFile = None,
     scenario: Scenario = "paper",
@@ -245,7 +315,16 @@ def evaluate(
     settled = _settle(config or scenario, settings, gate_m=gate, match_on=match_on)
     requirements = step.parse_requirements(require or [])
     reach_m = step.CLIP_M if clip and clip_m is None else clip_m
-    result = step.evaluate(map_, reference, out, config=settled, clip_m=reach_m, in_view=in_view)
+    result = step.evaluate(
+        map_,
+        reference,
+        out,
+        config=settled,
+        clip_m=reach_m,
+        in_view=in_view,
+        drive_path=drive,
+        versus_path=versus,
+    )
     missed = step.missed_requirements(result.totals, requirements)
     if as_json:
         _print_json({**asdict(result), "missed": missed})
@@ -466,10 +545,34 @@ def _print_evaluation(result: EvaluateResult) -> None:
             names = tuple(name for name in rows[0] if name not in ("run_id", "match_on", "gate_m", "null_reason"))
             typer.echo()
             _print_table(names, [tuple(row[name] for name in names) for row in rows])
+    _print_intervals(result.intervals)
+    _print_comparisons(result.comparisons)
     for name, number in result.counts.items():
         if number:
             typer.echo(f"{name}: {number}")
     _print_files(result.files)
+
+
+def _print_intervals(rows: tuple[dict[str, Any], ...]) -> None:
+    """Say how sure F1 and GOSPA_M are, and of what; all scores stand in intervals.csv."""
+    for row in rows:
+        if row["score"] in ("f1", "gospa_m") and row["low"] is not None:
+            typer.echo(
+                f"{row['score']} {row['estimate']:.4f}, {row['level']:.0%} interval "
+                f"{row['low']:.4f} to {row['high']:.4f}: {row['estimand']}"
+            )
+        elif row["score"] in ("f1", "gospa_m"):
+            typer.echo(f"{row['score']}: no interval: {row['note']}")
+    for note in sorted({row["note"] for row in rows if row["note"] and row["low"] is not None}):
+        typer.echo(f"  beware: {note}")
+
+
+def _print_comparisons(rows: tuple[dict[str, Any], ...]) -> None:
+    """Print the verdict on map A (--map) against map B (--versus), score by score."""
+    names = ("score", "difference", "low", "high", "p_value", "verdict")
+    if rows:
+        typer.echo("\nmap A (--map) minus map B (--versus):")
+        _print_table(names, [tuple(row[name] for name in names) for row in rows])
 
 
 def _print_files(files: tuple[Path, ...]) -> None:

@@ -142,7 +142,7 @@ def _match_lines(matches: pa.Table, fused: pa.Table) -> GeoDataFrame:
     """Return a line from every matched sign of the map to its reference; lines without length are left out."""
     import geopandas  # noqa: PLC0415
 
-    connection = connect()
+    connection = connect(spatial=False)
     connection.register("matches", matches)
     connection.register("signs", fused.select(["sign_id", BBOX, *_LABELS]))
     lines = run(connection, "evaluate/match_lines", {"min_length_m": _SHORTEST_LINE_M}).to_arrow_table()

@@ -17,8 +17,10 @@ from geofleet.algorithms.metrics import MapScore
 from geofleet.errors import ConfigError
 from geofleet.formats.layers import read_layer
 from geofleet.formats.results import write_csv, write_result_layers
+from geofleet.tables.certainty import comparison_rows, interval_rows
 from geofleet.tables.manifest import write_manifest
 from geofleet.tables.matching import class_confusion, match_layers, match_signs
+from geofleet.tables.scenes import load_drive
 from geofleet.tables.schemas import BBOX, GEOMETRY, MATCHES, REFERENCE, SCORES
 from geofleet.tables.scoring import (
     missed_requirements,
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 
     from geofleet.algorithms.metrics import MatchOn
     from geofleet.config import Config, EvaluateConfig
+    from geofleet.tables.scenes import Drive
 
     Ints = NDArray[np.int64]
 
@@ -73,6 +76,10 @@ class EvaluateResult:
         Scores of every source of the map alone, when it has several.
     summary
         Mean, standard deviation and number of nulls of every score over the runs.
+    intervals
+        Interval of every score, with its estimand in words: over runs when there are several, else along the road.
+    comparisons
+        Of the map with another one: difference of every score, interval, p-value and verdict.
     counts
         Signs left out by `--clip` and `--in-view`, and signs without an error ellipse.
     """
@@ -85,6 +92,8 @@ class EvaluateResult:
     confusion: tuple[dict[str, Any], ...] = ()
     sources: tuple[dict[str, Any], ...] = ()
     summary: tuple[dict[str, Any], ...] = ()
+    intervals: tuple[dict[str, Any], ...] = ()
+    comparisons: tuple[dict[str, Any], ...] = ()
     counts: dict[str, int] = field(default_factory=dict)
 
 
@@ -107,6 +116,8 @@ def evaluate(
     config: Config,
     clip_m: float | None = None,
     in_view: bool = False,
+    drive_path: Path | None = None,
+    versus_path: Path | None = None,
 ) -> EvaluateResult:
     """Score the main signs of a map against those of a reference and write tables and GIS layers.
 
@@ -124,6 +135,10 @@ def evaluate(
         Score only signs with a sign of the other layer within this distance, metres; all signs by default.
     in_view
         Score only reference signs that some pass had in view; the reference must be a `reference` table.
+    drive_path
+        A `drives` table: intervals take stretches of road along it.
+    versus_path
+        Another map: test whether the first is better, on the same reference.
 
     Raises
     ------
@@ -139,6 +154,7 @@ def evaluate(
     pairs = list(_pairs(map_, reference, clip_m=clip_m))
     matches = _match_pairs(pairs, config)
     scores = score_matches(matches, gate_m=gate_m, match_on=match_on)
+    drive = load_drive(drive_path) if drive_path else None
     used, ref_used = _used_rows(pairs, map_.num_rows, reference.num_rows)
     layers = {
         "fused": map_.filter(used),
@@ -152,6 +168,8 @@ def evaluate(
         "confusion": _confusion(pairs, gate_m=gate_m),
         "sources": _score_sources(pairs, gate_m=gate_m, match_on=match_on),
         "summary": summarise_scores(_totals(scores)),
+        "intervals": interval_rows(matches, _totals(scores), gate_m=gate_m, drive=drive),
+        "comparisons": _compare(matches, scores, versus_path, reference, drive, clip_m=clip_m, config=config),
     }
     files, n_without = _write(out, layers, more)
     counts = {
@@ -163,13 +181,34 @@ def evaluate(
     write_manifest(
         out,
         step="evaluate",
-        inputs=(map_path, reference_path),
+        inputs=[path for path in (map_path, reference_path, drive_path, versus_path) if path],
         config_digest=config.digest("evaluate"),
         settings=config.evaluate.model_dump() | {"clip_m": clip_m, "in_view": in_view},
         counts={"matches": matches.num_rows, "scores": scores.num_rows, **counts},
     )
     rows = {name: tuple(part) for name, part in more.items()}
     return EvaluateResult(out=out, totals=_totals(scores), files=files, counts=counts, **rows)
+
+
+def _compare(
+    matches: pa.Table,
+    scores: pa.Table,
+    versus_path: Path | None,
+    reference: pa.Table,
+    drive: Drive | None,
+    *,
+    clip_m: float | None,
+    config: Config,
+) -> list[dict[str, Any]]:
+    """Compare the map with another one; nothing without one."""
+    if versus_path is None:
+        return []
+    gate_m, match_on = config.evaluate.gate_m, config.evaluate.match_on
+    other = _main_signs(read_layer(versus_path).table)
+    other_matches = _match_pairs(list(_pairs(other, reference, clip_m=clip_m)), config)
+    other_scores = score_matches(other_matches, gate_m=gate_m, match_on=match_on)
+    totals = (_totals(scores), _totals(other_scores))
+    return comparison_rows((matches, other_matches), totals, gate_m=gate_m, drive=drive)
 
 
 def score_layers(map_: pa.Table, reference: pa.Table, *, config: EvaluateConfig) -> MapScore:

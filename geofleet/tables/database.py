@@ -35,8 +35,10 @@ class Statement:
     writes: tuple[tuple[str, str], ...]
 
 
-def connect(*, threads: int | None = None, memory_limit: str | None = None) -> duckdb.DuckDBPyConnection:
-    """Open an in-memory database with spatial loaded, x before y, and rows in a stable order.
+def connect(
+    *, threads: int | None = None, memory_limit: str | None = None, spatial: bool = True
+) -> duckdb.DuckDBPyConnection:
+    """Open an in-memory database, with spatial loaded and x before y unless no statement needs it (0.4 s).
 
     Raises
     ------
@@ -49,8 +51,9 @@ def connect(*, threads: int | None = None, memory_limit: str | None = None) -> d
     if memory_limit:
         config["memory_limit"] = memory_limit
     connection = duckdb.connect(config=config)
-    _load_spatial(connection)
-    connection.execute("SET geometry_always_xy = true")
+    if spatial:
+        _load_spatial(connection)
+        connection.execute("SET geometry_always_xy = true")
     return connection
 
 

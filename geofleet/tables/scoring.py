@@ -39,7 +39,7 @@ class Requirement:
 
 def score_matches(matches: pa.Table, *, gate_m: float, match_on: str) -> pa.Table:
     """Return the `scores` table of a `matches` table: per tile, per concept, both, and in total."""
-    connection = connect()
+    connection = connect(spatial=False)
     connection.register("matches", matches)
     counts = run(connection, "evaluate/counts").to_arrow_table()
     connection.close()
