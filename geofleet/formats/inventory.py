@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from geofleet.errors import ConfigError, InputError
+from geofleet.formats.datum import datum_of
 from geofleet.formats.inventory_codes import OSM, guess_country, is_osm, read_codes, read_osm, scheme_of
 from geofleet.formats.inventory_columns import choose_columns, numbers, parse_facings, parse_times, read_options, texts
 from geofleet.formats.inventory_files import detect, read_features
@@ -110,7 +111,8 @@ def _read(path: Path, features: Features, named: Mapping[str, str], options: Map
     signs, doubtful = _signs(path, table, chosen, places, plates, day_first=options.get("day_first"))
     skipped = Counter(features.skipped) + Counter(places.skipped) + Counter(plates.skipped)
     told_all = {reason: count for reason, count in (found | doubtful).items() if count}
-    return LayerRead(signs, features.file_format, dict(skipped), told_all)
+    datum = datum_of(places.crs, places.lon, places.lat)
+    return LayerRead(signs, features.file_format, dict(skipped), told_all, datum)
 
 
 def _settled(

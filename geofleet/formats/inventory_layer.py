@@ -9,6 +9,7 @@ import pyarrow as pa
 import shapely
 
 from geofleet.errors import InputError
+from geofleet.formats.datum import datum_of
 from geofleet.formats.inventory_columns import numbers, parse_times, texts
 from geofleet.formats.inventory_files import CRS84
 from geofleet.formats.positions import to_lonlat
@@ -47,7 +48,8 @@ def own_layer(path: Path, features: Features, crs: Any = None) -> LayerRead:
             todo="Export it again.",
         )
     place = (shapely.get_x(geometry), shapely.get_y(geometry))
-    lon, lat = to_lonlat(*place, crs or features.crs or CRS84, where=str(path))
+    crs = crs or features.crs or CRS84
+    lon, lat = to_lonlat(*place, crs, where=str(path))
     if np.isnan(lon).any():
         raise InputError(
             f"{int(np.isnan(lon).sum())} positions are not valid.", where=str(path), todo="Export it again."
@@ -56,9 +58,8 @@ def own_layer(path: Path, features: Features, crs: Any = None) -> LayerRead:
     columns = {c.name: _values(features.table, c) for c in SIGNS.all_columns if c.name in names}
     left = sum(name not in columns for name in names)
     found = {"columns that are none of the signs table": left} if left else {}
-    return LayerRead(
-        build_table(SIGNS, columns, (lon, lat)), features.file_format, features.skipped, features.found | found
-    )
+    signs = build_table(SIGNS, columns, (lon, lat))
+    return LayerRead(signs, features.file_format, features.skipped, features.found | found, datum_of(crs, lon, lat))
 
 
 def _values(table: pa.Table, column: Column) -> Any:
@@ -66,7 +67,8 @@ def _values(table: pa.Table, column: Column) -> Any:
     if pa.types.is_timestamp(column.type):
         return pa.array(parse_times(table[column.name])[0], column.type)
     if pa.types.is_string(column.type):
-        text = texts(table, column.name)
+        is_text = pa.types.is_string(table[column.name].type) or pa.types.is_large_string(table[column.name].type)
+        text = table[column.name].to_pylist() if is_text else texts(table, column.name)
         return text if column.nullable else [value or "" for value in text]
     number = numbers(table, column.name)
     return pa.array(number, from_pandas=True).cast(column.type)

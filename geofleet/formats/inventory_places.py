@@ -42,6 +42,8 @@ class Places:
         The feature is a line or an area, which the point stands for, shape (n,).
     skipped, found
         What was left out and why; what else is worth telling.
+    crs
+        What the coordinates are in.
     """
 
     feature: NDArray[np.int64]
@@ -50,6 +52,7 @@ class Places:
     is_extended: NDArray[np.bool_]
     skipped: dict[str, int]
     found: dict[str, int]
+    crs: Any
 
 
 def place_features(
@@ -88,7 +91,9 @@ def place_features(
         x, y = numbers(features.table, chosen.x), numbers(features.table, chosen.y)
         feature, is_extended = np.arange(len(x)), np.zeros(len(x), bool)
     x, y = (y, x) if swap_xy else (x, y)
-    lon, lat = to_lonlat(x, y, crs or features.crs or CRS84, where=str(path))
+    assumed = crs is None and features.crs is None
+    crs = crs or features.crs or CRS84
+    lon, lat = to_lonlat(x, y, crs, where=str(path))
     finite = np.isfinite(x) & np.isfinite(y)
     skipped["coordinates that are no number"] += int((~finite).sum())
     skipped["coordinates out of range"] += int((finite & np.isnan(lon)).sum())
@@ -96,10 +101,9 @@ def place_features(
     null = reject_null_island(lon[kept], lat[kept], where=str(path))
     skipped["at 0° N 0° E, in the Gulf of Guinea"] += int(null.sum())
     kept = kept[~null]
-    assumed = crs is None and features.crs is None
     found = {"no CRS stated, taken as OGC:CRS84": len(kept)} if assumed else {}
     reasons = {reason: count for reason, count in skipped.items() if count}
-    return Places(feature[kept], lon[kept], lat[kept], is_extended[kept], reasons, found)
+    return Places(feature[kept], lon[kept], lat[kept], is_extended[kept], reasons, found, crs)
 
 
 def _written(features: Features, chosen: InventoryColumns, skipped: Counter[str]) -> NDArray[np.object_] | None:

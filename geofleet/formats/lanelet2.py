@@ -104,7 +104,8 @@ def read_signs(
     }
     found |= {"unknown codes": sum(not row.meaning.known for row in rows)}
     found |= {"signs without a code": sum(row.kind == SIGN and not row.code for row in rows)}
-    return LayerRead(build_table(SIGNS, columns, (lon, lat)), FORMAT, map_.skipped, _told(map_.found | found))
+    table = build_table(SIGNS, columns, (lon, lat))
+    return LayerRead(table, FORMAT, map_.skipped, _told(map_.found | found), map_.datum)
 
 
 def read_lanes(
@@ -136,7 +137,7 @@ def read_lanes(
     }
     table = build_table(LANES, columns, np.array([shapely.LineString(line) for line in lines.values()], object))
     found = map_.found | {"with a speed limit": int((~np.isnan(speeds)).sum())}
-    return LayerRead(table, FORMAT, dict(skipped), _told(found))
+    return LayerRead(table, FORMAT, dict(skipped), _told(found), map_.datum)
 
 
 def _rows(map_: LaneletMap) -> list[_Row]:

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geofleet.errors import ConfigError, InputError
-from geofleet.formats.reading import GZIP, read_head
+from geofleet.formats.datum import datum_of
+from geofleet.formats.reading import GZIP, WGS84, read_head
 from geofleet.formats.xml import explained, iter_elements
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from geofleet.formats.reading import Datum
     from geofleet.formats.xml import Element
 
     Floats = NDArray[np.float64]
@@ -90,6 +92,8 @@ class LaneletMap:
         Relations by id.
     skipped, found
         What was left out and why; what else is worth telling.
+    datum
+        What the positions were in, and how they came to WGS 84.
     """
 
     lon: Floats
@@ -101,6 +105,7 @@ class LaneletMap:
     regulations: dict[str, Relation]
     skipped: dict[str, int]
     found: dict[str, int]
+    datum: Datum = WGS84
 
 
 def is_lanelet2(path: Path) -> bool:
@@ -247,6 +252,7 @@ class _RawMap:
             self.regulations,
             dict(self.skipped),
             {reason: count for reason, count in self.found.items() if count},
+            datum_of(projection.crs, lon[valid], lat[valid]) if projection else WGS84,
         )
 
     def _positions(self, numbers: Floats, projection: _Projection | None) -> tuple[Floats, Floats]:

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats import osm
+from geofleet.formats.osm_value import is_own_osm
 from geofleet.formats.reading import LayerRead, LayerStream, read_head
 from geofleet.tables.schemas import LANES, SIGNS, Schema
 from geofleet.tables.store import read_table
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-_OWN, _OPENDRIVE, _LANELET2, _INVENTORY = "geofleet", "opendrive", "lanelet2", "inventory"
+_OWN, _OWN_OSM, _OPENDRIVE, _LANELET2, _INVENTORY = "geofleet", "geofleet-osm", "opendrive", "lanelet2", "inventory"
 _MARK = b"geofleet:table"
 
 
@@ -54,6 +55,7 @@ class LayerFormat:
 FORMATS: Mapping[str, LayerFormat] = MappingProxyType(
     {
         _OWN: LayerFormat("a table of geofleet (.parquet)", "layers"),
+        _OWN_OSM: LayerFormat("signs that geofleet wrote as OpenStreetMap XML (.osm, .osc)", "osm_layer"),
         osm.FORMAT: LayerFormat(
             "OpenStreetMap (.osm.pbf, .osm, Overpass .json; .gz, .bz2)", "osm", sign_options=frozenset({"roads"})
         ),
@@ -91,6 +93,8 @@ def recognise(path: Path) -> str:
     if head.startswith(b"PAR1"):
         return _OWN if _is_own_table(path) else _INVENTORY
     encoding = osm.detect(head)
+    if encoding == "osm" and is_own_osm(head):
+        return _OWN_OSM
     if encoding in {"osm", "osm.gz"}:
         return _LANELET2 if import_module("geofleet.formats.lanelet2_map").is_lanelet2(path) else osm.FORMAT
     if encoding:

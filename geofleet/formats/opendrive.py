@@ -100,7 +100,8 @@ def read_signs(
     countries = Counter(signal.country for signal in placed.values() if signal.country)
     usual = countries.most_common(1)[0][0] if countries else None
     counts |= doubts(lon, lat, usual, where=str(path))
-    return LayerRead(build_table(SIGNS, columns, (lon, lat)), FORMAT, dict(reader.skipped), _positive(counts))
+    table = build_table(SIGNS, columns, (lon, lat))
+    return LayerRead(table, FORMAT, dict(reader.skipped), _positive(counts), georeference.datum(lon, lat))
 
 
 def read_lanes(path: Path, *, crs: str | None = None, origin: tuple[float, float] | None = None) -> LayerRead:

@@ -12,11 +12,13 @@ from pyproj.exceptions import CRSError, ProjError
 
 from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.errors import ConfigError, InputError
+from geofleet.formats.datum import datum_of, local_datum
 from geofleet.formats.xml import number, place
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from geofleet.formats.reading import Datum
     from geofleet.formats.xml import Element
 
     Floats = NDArray[np.float64]
@@ -86,6 +88,10 @@ class Georeference:
         if isinstance(self.frame, EnuFrame):
             return f"local frame at {self.frame.origin_lat_deg:.7f}, {self.frame.origin_lon_deg:.7f}"
         return str(self.frame.srs if self.frame.name in {"", "unknown"} else self.frame.name)[:120]
+
+    def datum(self, lon: Floats, lat: Floats) -> Datum:
+        """Return how points came to WGS 84, by their result, degrees."""
+        return local_datum(self.name) if isinstance(self.frame, EnuFrame) else datum_of(self.frame, lon, lat)
 
     def bearing_deg(self, x: Floats, y: Floats, direction: Floats) -> Floats:
         """Return directions in the file, radians counterclockwise from x, as degrees clockwise from true north.

@@ -19,6 +19,31 @@ MAX_LINE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
+class Datum:
+    """What coordinates were in, and how they came to WGS 84.
+
+    Parameters
+    ----------
+    crs
+        Coordinate reference system of the file.
+    to_wgs84
+        The operation used.
+    accuracy_m
+        Of that operation as its registry states it, m; None when nobody does.
+    doubt
+        What may be wrong by up to a metre or two, in words; "" when nothing is.
+    """
+
+    crs: str = "OGC:CRS84"
+    to_wgs84: str = "none needed"
+    accuracy_m: float | None = 0.0
+    doubt: str = ""
+
+
+WGS84 = Datum()
+
+
+@dataclass(frozen=True, slots=True)
 class LayerRead:
     """A table read from one file.
 
@@ -32,12 +57,15 @@ class LayerRead:
         Reason to number of items left out.
     found
         Other counts worth telling, e.g. unknown codes or gaps.
+    datum
+        CRS of the file, and how its coordinates came to WGS 84.
     """
 
     table: pa.Table
     file_format: str
     skipped: dict[str, int] = field(default_factory=dict)
     found: dict[str, int] = field(default_factory=dict)
+    datum: Datum = WGS84
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +76,7 @@ class LayerStream:
     ----------
     pieces
         Gives tables in the schema asked for, each sorted by key and all of it before the next; at least one.
-    file_format, skipped, found
+    file_format, skipped, found, datum
         As `LayerRead`.
     """
 
@@ -56,6 +84,7 @@ class LayerStream:
     file_format: str
     skipped: dict[str, int] = field(default_factory=dict)
     found: dict[str, int] = field(default_factory=dict)
+    datum: Datum = WGS84
 
     @property
     def table(self) -> pa.Table:
