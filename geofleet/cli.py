@@ -54,6 +54,12 @@ SchemeOption = Annotated[
 CountryOption = Annotated[
     str | None, typer.Option("--country", help="ISO 3166-1 alpha-2 of codes that do not name it.")
 ]
+SchemeOption = Annotated[
+    str | None, typer.Option("--scheme", help="Scheme of the codes: mapillary, osm, vienna, us ...")
+]
+CountryOption = Annotated[
+    str | None, typer.Option("--country", help="ISO 3166-1 alpha-2 of codes that do not name it.")
+]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="A TOML file of settings.")]
 Scenario = Annotated[str, typer.Option("--scenario", help="Name of a packaged scenario, or a TOML file.")]
@@ -175,7 +181,7 @@ def ingest_detections(
     crs: Crs = None,
     scheme: SchemeOption = None,
     country: CountryOption = None,
-    run_id: Annotated[str, typer.Option(help="Of rows that do not name one.")] = "fleet",
+    run_id: Annotated[str | None, typer.Option(help="Of rows that do not name one; fleet by default.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Read the detections of a real fleet into a `detections` table; bad rows go to <out>_rejected.parquet.
