@@ -54,12 +54,6 @@ SchemeOption = Annotated[
 CountryOption = Annotated[
     str | None, typer.Option("--country", help="ISO 3166-1 alpha-2 of codes that do not name it.")
 ]
-SchemeOption = Annotated[
-    str | None, typer.Option("--scheme", help="Scheme of the codes: mapillary, osm, vienna, us ...")
-]
-CountryOption = Annotated[
-    str | None, typer.Option("--country", help="ISO 3166-1 alpha-2 of codes that do not name it.")
-]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="A TOML file of settings.")]
 Scenario = Annotated[str, typer.Option("--scenario", help="Name of a packaged scenario, or a TOML file.")]
