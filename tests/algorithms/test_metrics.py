@@ -239,3 +239,29 @@ def test_agrees_with_stone_soup():
         assert s.gospa == pytest.approx(metric.value["distance"], abs=1e-9)
         assert s.sum_sq_error_m2 == pytest.approx(metric.value["localisation"], abs=1e-9)
         assert 2 * (s.fp + s.fn) == pytest.approx(metric.value["missed"] + metric.value["false"])
+
+
+# Figures 3 to 5 of the paper, means over ten runs: fleet size, TP, FP, FN, F1, GOSPA_M.
+FIGURES = (
+    (5, 23.9, 6.7, 9.1, 0.7495, 1.5400),
+    (10, 26.8, 4.4, 6.2, 0.8345, 1.2694),
+    (15, 28.2, 3.8, 4.8, 0.8677, 1.1335),
+    (20, 29.0, 2.9, 4.0, 0.8935, 1.1013),
+    (25, 29.6, 2.1, 3.4, 0.9149, 1.0145),
+    (30, 29.6, 2.1, 3.4, 0.9149, 0.9324),
+    (35, 29.9, 1.7, 3.1, 0.9255, 0.9050),
+    (40, 30.0, 1.7, 3.0, 0.9271, 0.8158),
+    (45, 29.4, 1.9, 3.6, 0.9143, 0.8407),
+    (50, 30.0, 1.5, 3.0, 0.9300, 0.7802),
+)
+
+
+@pytest.mark.parametrize("point", FIGURES, ids=lambda p: f"{p[0]} vehicles")
+def test_the_figures_of_the_paper_agree_with_each_other(point):
+    """The counts of Figure 4 are of 33 signs and give the F1 of Figure 3; with c = 2 m, Figure 5 leaves an MSE_M."""
+    _, tp, fp, fn, f1, gospa_m = point
+    assert tp + fn == pytest.approx(33.0)
+    scores = derive_scores(tp, fp, fn, 0.0, 2.0)
+    assert float(scores["f1"]) == pytest.approx(f1, abs=0.0025)  # the mean of ten F1 is not the F1 of mean counts
+    mse_m2 = gospa_m**2 - float(scores["gospa_m"]) ** 2
+    assert 0.3 < mse_m2 < 1.1
