@@ -85,6 +85,8 @@ def _csv_batches(path: Path) -> Iterator[Batch]:
     refuse_long_lines(path)
     encoding = _encoding(path)
     names, delimiter = _header(path, encoding)
+    if _is_one_line(path):
+        return
     broken: list[tuple[int, str]] = []
 
     def keep(row: Any) -> str:
@@ -161,6 +163,12 @@ def _encoding(path: Path) -> str:
     except UnicodeDecodeError:
         return "cp1252"
     return "utf-8"
+
+
+def _is_one_line(path: Path) -> bool:
+    """Tell whether a file holds a header and no row, which Arrow takes for a fault."""
+    with path.open("rb") as file:
+        return not file.readline() or not file.read(_SAMPLE_BYTES).strip()
 
 
 def _header(path: Path, encoding: str) -> tuple[list[str], str]:

@@ -7,6 +7,7 @@ its vehicle. What a file does not say stays null. Rows that cannot be used come 
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -29,7 +30,7 @@ from geofleet.formats.detection_columns import (
     time_column,
 )
 from geofleet.formats.detection_files import read_batches
-from geofleet.formats.inventory_codes import guess_country, scheme_of
+from geofleet.formats.inventory_codes import OSM, guess_country, scheme_of
 from geofleet.formats.positions import country_at, doubts, reject_null_island, to_lonlat
 from geofleet.tables.schemas import DETECTIONS
 from geofleet.tables.store import build_table
@@ -51,6 +52,7 @@ REJECTED = pa.schema([("reason", pa.string()), ("source", pa.string()), ("row", 
 _CRS84 = "OGC:CRS84"
 _MAX_LAT_DEG = 85.05  # beyond it no tile owns a sign
 _POINT = 0
+_PREFIXED = re.compile(r"[A-Z]{2}:")
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,8 +229,12 @@ def _classes(table: pa.Table, plan: _Plan) -> tuple[pa.Array, pa.Array, pa.Array
     # each distinct pair of code and country is looked up once
     key = pc.binary_join_element_wise(raw, pc.fill_null(country, ""), "\x1f").dictionary_encode()
     pairs = [str(pair).split("\x1f") for pair in key.dictionary.to_pylist()]
+    scheme = plan.scheme
+    if scheme in {"", OSM}:  # OpenStreetMap's values name their country: DE:274[50]; without one they are its words
+        pairs = [[code[3:], code[:2]] if _PREFIXED.match(code) else [code, land] for code, land in pairs]
+        scheme = ""
     known = load_taxonomy().classify(
-        [code for code, _ in pairs], country=[land or None for _, land in pairs], scheme=plan.scheme or None
+        [code for code, _ in pairs], country=[land or None for _, land in pairs], scheme=scheme or None
     )
     classes = pa.array(known.sign_class.tolist(), pa.string()).take(key.indices)
     is_known = pa.array(known.known.tolist(), pa.bool_()).take(key.indices)

@@ -113,8 +113,10 @@ def read_epochs(
     refuse_long_lines(path)
     layout = _layout(path, columns)
     frame, n_broken = _read(path, layout)
+    notes = list(layout.told)
     if crs is None and origin is None and utm is None:
         crs, origin = layout.crs, layout.origin
+        notes += [f"origin {origin[0]}, {origin[1]} of the profile or the TOML file"] if origin else []
     local = local_crs(crs, origin, utm)
     x, y, z = (_numbers(frame, layout.columns.get(thing)) for thing in ("x", "y", "height"))
     lon, lat, height_m = to_places(x, y, z, local, where=str(path))
@@ -139,7 +141,7 @@ def read_epochs(
             todo="Name the columns: --columns time=…,x=…,y=….",
         )
     skipped = {NO_EPOCH: n_broken + int((~readable).sum()), NO_POSITION: int((readable & ~placed).sum())}
-    found = dict.fromkeys((*layout.told, *told), int(placed.sum()))
+    found = dict.fromkeys((*notes, *told), int(placed.sum()))
     return _split_drives(epochs, frame, layout.columns.get("drive"), placed), skipped, found
 
 
@@ -174,8 +176,6 @@ def _layout(path: Path, columns: Mapping[str, str] | Path | None) -> _Layout:
             todo="Name them: --columns time=…,x=…,y=….",
         )
     origin = options.get("origin") or profile.get("origin")
-    if name and origin and not options.get("origin"):
-        told.append(f"origin {origin[0]}, {origin[1]} of the profile, where none is given")
     return _Layout(
         columns=merged,
         delimiter=r"\s+" if profile.get("prefix") else delimiter,

@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from geofleet.algorithms.geodesy import to_ecef
+from geofleet.errors import ConfigError, InputError
+from geofleet.formats.drives import detect, read_drive
+from geofleet.tables.store import lonlat
+
+
+def csv_file(tmp_path, text, name="drive.csv"):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8", newline="")
+    return path
+
+
+def length_m(table):
+    return np.linalg.norm(np.diff(to_ecef(*lonlat(table)), axis=0), axis=1).sum()
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "first", "expected"),
+    [
+        ("nagoya/reference.csv", 6151, datetime(2023, 7, 11, 6, 4, 12, tzinfo=UTC), (4180, (136.86, 35.14))),
+        ("tartu/wp_utm_raadi_to_delta.csv", 1462, None, (3080, (26.71, 58.38))),
+        (
+            "toronto/radar_poses_2021-08-05-13-34.csv",
+            4477,
+            datetime(2021, 8, 5, 17, 34, 46, 551599, tzinfo=UTC),
+            (7930, (-79.47, 43.78)),
+        ),
+        ("berlin/Berlin_Potsdamer_Platz_GT.txt", 1372, None, (1550, (13.37, 52.50))),
+        ("berlin/Berlin_Gendarmenmarkt_GT.txt", 5921, None, (4890, (13.39, 52.51))),
+        (
+            "gsdc/gsdc_2021_Pixel4_ground_truth.csv",
+            199,
+            datetime(2020, 5, 14, 22, 10, 45, 442000, tzinfo=UTC),
+            (None, (-122.1, 37.42)),
+        ),
+    ],
+)
+def test_shared_trajectories_by_their_profiles(shared_data, name, n, first, expected):
+    length, box = expected
+    layer = read_drive(shared_data / "trajectory" / name)
+    assert layer.table.num_rows + sum(layer.skipped.values()) == n
+    assert layer.table["t_utc"][0].as_py() == first
+    assert length is None or length_m(layer.table) == pytest.approx(length, rel=0.01)
+    assert np.median(np.column_stack(lonlat(layer.table)), axis=0) == pytest.approx(box, abs=0.05)
+    assert any(told.startswith("profile ") for told in layer.found)
+    assert set(layer.table["segment"].to_pylist()) == {0}
+
+
+def test_times_from_velocities_give_the_velocities_back(shared_data):
+    path = shared_data / "trajectory" / "tartu" / "wp_utm_raadi_to_delta.csv"
+    table = read_drive(path).table
+    stated = np.loadtxt(path, delimiter=",", skiprows=1, usecols=4)
+    moving = stated > 2
+    off = np.abs(table["speed_mps"].to_numpy()[moving] / stated[moving] - 1)
+    assert np.median(off) < 0.01
+    assert off.max() < 0.25  # where it starts and stops
+
+
+def test_an_origin_that_is_given_wins_over_the_profile(shared_data):
+    path = shared_data / "trajectory" / "tartu" / "wp_utm_raadi_to_delta.csv"
+    north = lonlat(read_drive(path, origin=(59.385345, 26.726272)).table)[1]
+    np.testing.assert_allclose(north - lonlat(read_drive(path).table)[1], 1.0, atol=1e-3)
+    by_utm = read_drive(path, utm=("EPSG:32635", 0.0, 6_400_000.0))
+    assert not any(told.startswith("origin") for told in by_utm.found)
+
+
+@pytest.mark.parametrize(
+    ("time", "expected"),
+    [
+        ("2024-05-01T12:00:00Z", datetime(2024, 5, 1, 12, tzinfo=UTC)),
+        ("1714564800", datetime(2024, 5, 1, 12, tzinfo=UTC)),
+        ("1714564800250", datetime(2024, 5, 1, 12, 0, 0, 250_000, tzinfo=UTC)),
+        ("1714564800000000000", datetime(2024, 5, 1, 12, tzinfo=UTC)),
+        ("12.5", None),
+    ],
+)
+def test_times_are_told_by_their_size(tmp_path, time, expected):
+    layer = read_drive(csv_file(tmp_path, f"timestamp;lat;lon\r\n{time};50;10\r\n"))
+    assert layer.table["t_utc"][0].as_py() == expected
+    assert any("times read as" in told for told in layer.found)
+
+
+def test_named_columns_formats_and_crs(tmp_path):
+    text = "a,b,c,d\n" + "".join(f"{1398600018 + s},{486000 + 10 * s},5885000,z{s % 2}\n" for s in range(6))
+    columns = {"time": "a", "x": "b", "y": "c", "drive": "d", "time_format": "gps_s"}
+    table = read_drive(csv_file(tmp_path, text), columns=columns, crs="EPSG:25832").table
+    assert table["drive_id"].to_pylist() == ["drive-z0"] * 3 + ["drive-z1"] * 3
+    assert table["t_utc"][0].as_py() == datetime(2024, 5, 1, 12, tzinfo=UTC)
+    assert table["speed_mps"].to_numpy() == pytest.approx(10, rel=1e-3)
+    assert table["heading_deg"].to_numpy() == pytest.approx(90, abs=0.5)
+
+
+def test_a_toml_file_says_the_same(tmp_path):
+    toml = csv_file(tmp_path, 'crs = "EPSG:25832"\n[columns]\nx = "b"\ny = "c"\ntime = "a"\n', "m.toml")
+    layer = read_drive(csv_file(tmp_path, "a,b,c\n1714564800,486000,5885000\nx,y,z\n"), columns=toml)
+    assert layer.table.num_rows == 1
+    assert layer.skipped == {"lines that are no epoch": 1}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"columns": {"colour": "a"}}, "unknown: colour"),
+        ({"columns": {"x": "nope"}}, "no column 'nope'"),
+        ({"columns": {"x": "lon", "time_format": "lunar"}}, "unknown time_format"),
+        ({"crs": "EPSG:4326", "origin": (50.0, 10.0)}, "contradict"),
+        ({"origin": (95.0, 10.0)}, "outside of UTM"),
+        ({"crs": "EPSG:nope"}, "unknown CRS"),
+        ({"crs": "EPSG:4978"}, "third coordinate"),
+    ],
+)
+def test_options_that_make_no_sense_are_named(tmp_path, options, message):
+    path = csv_file(tmp_path, "time,lat,lon\n1714564800,50,10\n")
+    with pytest.raises(ConfigError, match=message):
+        read_drive(path, **options)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("time,lat,lon\n1,0.1,0.1\n2,0.1,0.2\n", "Gulf of Guinea"),
+        ("time,lat,lon\n1,136.9,35.1\n2,136.9,35.2\n", "axes look swapped"),
+        ("time,lat,lon\n1,nan,inf\n", "no epoch with a position"),
+        ("time,lat,lon\n", "no epoch with a position"),
+        ("time,lat,lon\n" + "9" * (2 << 20), "line 2: the line is longer"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(tmp_path, text, message):
+    path = csv_file(tmp_path, text)
+    assert detect(path.read_bytes()[:4096]) == "csv"
+    with pytest.raises(InputError, match=message) as caught:
+        read_drive(path)
+    assert str(path) in str(caught.value)
+
+
+def test_an_inventory_is_no_drive():
+    assert detect(b"id,lat,lon,code\n1,50,10,206\n") == ""
