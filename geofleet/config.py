@@ -82,10 +82,13 @@ class TrackingConfig(_Section):
 class AggregateConfig(_Section):
     """How detections of many passes become signs."""
 
-    method: Literal["dbscan"]
+    method: Literal["dbscan", "hdbscan", "kmeans", "kmedoids"]
     semantic: Literal["first", "after"]
     eps_m: Positive
     min_samples: Annotated[int, Field(ge=1)]
+    min_cluster_size: Annotated[int, Field(ge=2)]
+    k: Annotated[int, Field(ge=0)]
+    max_k: Annotated[int, Field(ge=1)]
     min_support: Annotated[int, Field(ge=1)]
     min_support_share: Rate
     tile_zoom: Annotated[int, Field(ge=12, le=20)]

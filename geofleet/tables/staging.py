@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from geofleet.algorithms.clustering_kernels import radix_argsort
 from geofleet.tables.binding import bind_table
 from geofleet.tables.database import load_sql, run
 from geofleet.tables.schemas import DETECTIONS
@@ -17,6 +18,25 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import duckdb
+    from numpy.typing import NDArray
+
+    Columns = dict[str, NDArray[Any]]
+
+FINE_ZOOM = 18  # cells of 100 m at 50 degrees: hot tiles are split down to these
+_CELL_M = 3_400_000.0  # a cell of zoom 0 at 85.05 degrees is at least this wide
+BLOCK_ROWS = 250_000  # rows that are sorted into their batches at a time
+_MAX_ID_BITS = 1 << 29  # 64 MB of track ids
+NEVER_BEGUN, NEVER_ENDED = np.iinfo(np.int64).max, np.iinfo(np.int64).min  # times that are missing, µs
+_HASHES_OF_PASSES = "pass_hash.npy"
+_ROW = np.dtype(
+    [
+        *((name, np.float64) for name in ("lon", "lat", "n_frames", "spread_m2", "class_confidence")),
+        *((name, np.int64) for name in ("track_id", "t_first_us", "t_last_us")),
+        *((name, np.int32) for name in ("tile_code", "pass_code", "class_code")),
+        ("is_owned", np.bool_),
+    ],
+    align=True,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +68,11 @@ def stage_detections(
     detections
         A `detections` table: a file, or a folder partitioned by run and vehicle.
     folder
-        Where the batches go, `<batch>.parquet`.
+        Where the batches go, `batch_path(folder, number)`.
     zoom, halo_m
         Size of the tiles, and the margin that each reads, metres.
     batch_rows
-        Detections that the tiles of a batch own; a tile is never split.
+        Detections that the tiles of a batch own; a tile that owns more is split.
     n_vehicles
         Use the first so many of every run; 0 for all.
 
@@ -63,26 +83,51 @@ def stage_detections(
     TableError
         A column is missing or mistyped.
     """
+    fine_zoom = max(zoom, FINE_ZOOM)
     bind_table(connection, DETECTIONS, detections)
     connection.sql(load_sql("aggregate/judged").text).create_view("judged")
+    _materialise(connection, "aggregate/reporting")
+    _find_suspects(connection)
     _materialise(connection, "aggregate/copies")
     _materialise(connection, "aggregate/fleet", {"n_vehicles": n_vehicles})
-    connection.sql(load_sql("aggregate/points").text).create_view("points")
     _materialise(connection, "aggregate/passes")
+    connection.sql(load_sql("aggregate/points").text).create_view("points")
     _materialise(connection, "aggregate/classes")
-    _materialise(connection, "tiles/assign", {"zoom": zoom, "batch_rows": batch_rows})
-    _deal(run(connection, "tiles/members", {"zoom": zoom, "halo_m": halo_m}).to_arrow_reader(batch_rows), folder)
+    _materialise(connection, "tiles/counts", {"fine_zoom": fine_zoom})
+    _materialise(connection, "tiles/leaves", {"zoom": zoom, "fine_zoom": fine_zoom, "batch_rows": batch_rows})
+    _materialise(connection, "tiles/assign", {"batch_rows": batch_rows})
+    reach = {"fine_zoom": fine_zoom, "halo_m": halo_m, "n_around": math.ceil(halo_m / _CELL_M * 2.0**fine_zoom) or 1}
+    _materialise(connection, "tiles/readers", reach)
+    members = run(connection, "tiles/members", {"fine_zoom": fine_zoom})
+    _deal(members.to_arrow_reader(BLOCK_ROWS), folder)
+    passes = connection.sql("SELECT DISTINCT pass_code, pass_hash FROM passes ORDER BY pass_code").fetchnumpy()
+    np.save(folder / _HASHES_OF_PASSES, np.asarray(passes["pass_hash"], np.uint64))
     fleet = connection.table("fleet").to_arrow_table()
+    n_rows, n_usable = connection.table("reporting").aggregate("sum(n_rows), sum(n_usable)").fetchall()[0]
     return Staged(
         folder=folder,
         tiles=connection.table("assign").to_arrow_table(),
         classes=tuple(connection.table("classes").to_arrow_table()["sign_class"].to_pylist()),
         fleet=dict(zip(fleet["run_id"].to_pylist(), fleet["n_reporting"].to_pylist(), strict=True)),
-        rejected=pa.concat_tables(
-            [run(connection, f"checks/detections_{name}").to_arrow_table() for name in ("invalid", "duplicate")]
-        ),
-        n_detections=connection.table("detections").count("*").fetchall()[0][0],
+        rejected=_rejected(connection, n_invalid=(n_rows or 0) - (n_usable or 0)),
+        n_detections=n_rows or 0,
     )
+
+
+def batch_path(folder: Path, number: int) -> Path:
+    """Return the file of a batch."""
+    return folder / f"{number}.rows"
+
+
+def read_rows(path: Path) -> Columns:
+    """Read a batch: one array a column of `tiles/members`, and the hash of each row's pass."""
+    rows = np.fromfile(path, _ROW)
+    columns: Columns = {
+        name: rows[name].astype(np.int64 if kind.kind == "i" else kind)
+        for name, kind in ((name, _ROW[name]) for name in _ROW.names or ())
+    }
+    hashes = np.load(path.with_name(_HASHES_OF_PASSES), mmap_mode="r")
+    return columns | {"pass_hash": hashes[columns["pass_code"]]}
 
 
 def _materialise(connection: duckdb.DuckDBPyConnection, name: str, params: dict[str, Any] | None = None) -> None:
@@ -91,18 +136,34 @@ def _materialise(connection: duckdb.DuckDBPyConnection, name: str, params: dict[
     connection.from_arrow(table).create(name.rpartition("/")[2])
 
 
-def _deal(rows: pa.RecordBatchReader, folder: Path) -> None:
-    """Append the rows to one file a batch as they come, so that only a part is ever in memory."""
-    writers: dict[int, pq.ParquetWriter] = {}
-    schema = pa.schema([field for field in rows.schema if field.name != "batch"])
-    try:
-        for block in rows:
-            table = pa.Table.from_batches([block]).sort_by("batch")
-            numbers, starts = np.unique(table["batch"].to_numpy(), return_index=True)
-            for number, start, stop in zip(numbers.tolist(), starts, [*starts[1:], table.num_rows], strict=True):
-                if number not in writers:
-                    writers[number] = pq.ParquetWriter(folder / f"{number}.parquet", schema, compression="none")
-                writers[number].write_table(table.slice(start, stop - start).select(schema.names))
-    finally:
-        for writer in writers.values():
-            writer.close()
+def _find_suspects(connection: duckdb.DuckDBPyConnection) -> None:
+    """Keep the passes that may repeat a key: by bit strings or, when the ids are too spread for these, all of them."""
+    low, high, n_passes = (
+        connection.table("reporting").aggregate("min(track_low), max(track_high), count(n_usable)").fetchall()[0]
+    )
+    if low is not None and (high - low + 1) * n_passes <= _MAX_ID_BITS:
+        _materialise(connection, "aggregate/suspects", {"low": low, "high": high})
+    else:
+        connection.table("reporting").filter("n_usable > 0").project("run_id, pass_id").distinct().create("suspects")
+
+
+def _rejected(connection: duckdb.DuckDBPyConnection, *, n_invalid: int) -> pa.Table:
+    """Return the rows that cannot be used; the detections are scanned for bad ones only if there are any."""
+    copies = run(connection, "checks/detections_duplicate").to_arrow_table()
+    if n_invalid == 0:
+        return copies
+    return pa.concat_tables([run(connection, "checks/detections_invalid").to_arrow_table(), copies])
+
+
+def _deal(blocks: pa.RecordBatchReader, folder: Path) -> None:
+    """Append the rows to one file a batch as they come: one block is in memory, one file is open at a time."""
+    for block in blocks:
+        batch = block.column("batch").to_numpy().astype(np.int64)
+        order = radix_argsort(batch, np.arange(batch.size))
+        rows = np.empty(batch.size, _ROW)
+        for name in _ROW.names or ():
+            rows[name] = block.column(name).to_numpy(zero_copy_only=False)[order]
+        numbers, starts = np.unique(batch[order], return_index=True)
+        for number, start, stop in zip(numbers.tolist(), starts, [*starts[1:], batch.size], strict=True):
+            with batch_path(folder, number).open("ab") as file:
+                rows[start:stop].tofile(file)

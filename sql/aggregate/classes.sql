@@ -1,9 +1,9 @@
 -- why: a number for every class, in alphabetical order
 -- reads: @aggregate/points
 -- params: none
--- writes: sign_class VARCHAR, class_code BIGINT
+-- writes: sign_class VARCHAR, class_code INTEGER
 SELECT
     sign_class,
-    row_number() OVER (ORDER BY sign_class) - 1 AS class_code
+    (row_number() OVER (ORDER BY sign_class) - 1)::INTEGER AS class_code
 FROM (SELECT DISTINCT sign_class FROM points)
 ORDER BY class_code

@@ -1,5 +1,5 @@
 -- why: the usable detections that share their key with another; copy 1, the first by its values, is the one kept
--- reads: @aggregate/judged
+-- reads: @aggregate/judged, @aggregate/suspects
 -- params: none
 -- writes: reason VARCHAR, run_id VARCHAR, vehicle_id VARCHAR, pass_id VARCHAR, track_id BIGINT, sign_class VARCHAR,
 --         lon DOUBLE, lat DOUBLE, n_frames BIGINT, spread_m2 DOUBLE, class_confidence DOUBLE, t_first_us BIGINT,
@@ -10,6 +10,7 @@ WITH repeated AS (
         pass_id,
         track_id
     FROM judged
+    SEMI JOIN suspects USING (run_id, pass_id)
     WHERE reason IS NULL
     GROUP BY run_id, pass_id, track_id
     HAVING count(*) > 1

@@ -1,0 +1,119 @@
+"""How many passes had a place in view: what a sign's support is measured against.
+
+A pass had a place in view when one vertex of its reported path is nearer than the range of its sensor and the place
+lies within half the opening angle of the direction driven. Occlusion, and the error of the reported path, are not in
+it: it counts who *could* have reported the place.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from geofleet.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+_REACH = 1  # cells are as wide as the longest range
+
+
+def count_opportunities(xy: Floats, path_xy: Floats, first: Ints, *, range_m: Floats, fov_deg: Floats) -> Ints:
+    """Count, for every place, the passes that had it in view.
+
+    Parameters
+    ----------
+    xy
+        (n, 2) places, east and north, metres.
+    path_xy
+        (m, 2) vertices of all paths in the same frame, in the order driven; a frame of the camera each, or denser.
+    first
+        (n_passes + 1,) `first[p]:first[p + 1]` are the vertices of pass p. A path of one vertex has no direction
+        and saw nothing.
+    range_m, fov_deg
+        (n_passes,) of the sensor; the full opening angle.
+
+    Returns
+    -------
+    (n,) int64.
+
+    Raises
+    ------
+    InputError
+        A coordinate or a sensor's value is not finite, or a range is not positive.
+    """
+    values = (xy, path_xy, range_m, fov_deg)
+    if not all(np.isfinite(v).all() for v in values) or (np.asarray(range_m) <= 0).any():
+        raise InputError(
+            "a position, range or opening angle is not finite, or a range is not positive.", where="passes"
+        )
+    if len(xy) == 0 or len(path_xy) == 0:
+        return np.zeros(len(xy), np.int64)
+    side_m = float(np.max(range_m))
+    low = xy.min(axis=0)
+    cell = np.floor((xy - low) / side_m).astype(np.int64) + _REACH
+    width = int(cell[:, 0].max()) + _REACH + 1
+    keys = cell[:, 1] * width + cell[:, 0]
+    order = np.argsort(keys, kind="stable")
+    cells, starts = np.unique(keys[order], return_index=True)
+    counts: Ints = _count(
+        np.ascontiguousarray(xy[order], np.float64),
+        cells,
+        np.append(starts, len(xy)),
+        (np.floor((path_xy - low) / side_m).astype(np.int64) + _REACH, width),
+        np.ascontiguousarray(path_xy, np.float64),
+        first,
+        np.asarray(range_m, np.float64),
+        np.cos(np.radians(np.minimum(fov_deg, 360.0) / 2)),
+    )
+    result = np.empty_like(counts)
+    result[order] = counts
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _heading(path_xy: Floats, a: int, b: int, i: int) -> tuple[float, float]:
+    """Return the unit vector from the vertex before to the vertex after, zero where the car did not move."""
+    before, after = max(i - 1, a), min(i + 1, b - 1)
+    east, north = path_xy[after, 0] - path_xy[before, 0], path_xy[after, 1] - path_xy[before, 1]
+    length = math.hypot(east, north)
+    return (east / length, north / length) if length > 0 else (0.0, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _count(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
+    xy: Floats,
+    cells: Ints,
+    starts: Ints,
+    grid: tuple[Ints, int],
+    path_xy: Floats,
+    first: Ints,
+    range_m: Floats,
+    cos_half_fov: Floats,
+) -> Ints:
+    vertex_cell, width = grid
+    counts, last_pass = np.zeros(len(xy), np.int64), np.full(len(xy), -1, np.int64)
+    for p in range(first.size - 1):
+        for i in range(first[p], first[p + 1]):
+            east, north = _heading(path_xy, first[p], first[p + 1], i)
+            column, row = vertex_cell[i]
+            if (east == 0.0 and north == 0.0) or column < 0 or column > width:
+                continue
+            for key_row in range(row - _REACH, row + _REACH + 1):
+                low = np.searchsorted(cells, key_row * width + max(column - _REACH, 0))
+                high = np.searchsorted(cells, key_row * width + min(column + _REACH, width - 1), side="right")
+                for j in range(starts[low], starts[high]):
+                    if last_pass[j] == p:
+                        continue
+                    de, dn = xy[j, 0] - path_xy[i, 0], xy[j, 1] - path_xy[i, 1]
+                    d = math.hypot(de, dn)
+                    if d < range_m[p] and de * east + dn * north > d * cos_half_fov[p]:
+                        last_pass[j] = p
+                        counts[j] += 1
+    return counts

@@ -1,0 +1,135 @@
+"""What is done with a batch of tiles, wherever it runs: read, cluster, fuse; and the clusters that cross tile borders.
+
+A cluster leaves as one entry in each of a dictionary of equally long columns, `run_code` to `t_last_us`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from geofleet.algorithms.fusion import fuse, hash_members, information_weights, move_to_members, vote
+from geofleet.algorithms.tiling import cluster_tiles, join_open, quadkey_bounds
+from geofleet.tables.staging import read_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    Columns = dict[str, NDArray[Any]]
+    Flags = NDArray[np.bool_]
+    Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class TileTask:
+    """A batch of tiles: plain data, so that it can be sent anywhere."""
+
+    path: Path
+    first_tile: int
+    tiles: tuple[str, ...]
+    runs: tuple[int, ...]
+    eps_m: float
+    min_samples: int
+    semantic: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileResult:
+    """Fused clusters that are all the batch's own, and the rows of the others."""
+
+    clusters: Columns
+    open_rows: Columns
+
+
+def cluster_batch(task: TileTask) -> TileResult:
+    """Cluster one batch of tiles by DBSCAN, fuse the clusters that are all its own and hand back the others."""
+    rows = read_rows(task.path)
+    tile = rows["tile_code"] - task.first_tile
+    rows["run_code"] = np.asarray(task.runs, np.int64)[tile]
+    bounds = quadkey_bounds(task.tiles)
+    found = cluster_tiles(
+        rows["lon"],
+        rows["lat"],
+        tile=tile,
+        tile_centres_deg=np.column_stack((bounds[:, [0, 2]].mean(axis=1), bounds[:, [1, 3]].mean(axis=1))),
+        is_owned=rows["is_owned"],
+        codes=rows["class_code"] if task.semantic == "first" else np.zeros_like(rows["class_code"]),
+        eps_m=task.eps_m,
+        min_samples=task.min_samples,
+    )
+    open_rows = {name: values[found.open_row] for name, values in rows.items()}
+    open_rows |= {"cluster": found.open_cluster, "is_core": found.open_is_core}
+    closed = {name: values[found.closed_row] for name, values in rows.items()}
+    return TileResult(fuse_members(closed, found.closed_cluster), open_rows)
+
+
+def fuse_open(parts: Sequence[Columns]) -> Columns:
+    """Join the open clusters of all batches and fuse them."""
+    n_before = 0
+    numbered = []
+    for part in parts:
+        # a cluster belongs to one tile, and clusters are numbered within a batch
+        numbered.append(part | {"cluster": part["cluster"] + n_before})
+        n_before += int(part["cluster"].max(initial=-1)) + 1
+    rows = concatenate(numbered)
+    if not rows:
+        return {}
+    order = np.lexsort((rows["track_id"], rows["pass_code"]))
+    is_new = (np.diff(rows["pass_code"][order], prepend=-1) != 0) | (np.diff(rows["track_id"][order], prepend=0) != 0)
+    point = np.empty(len(order), np.int64)
+    point[order] = np.cumsum(is_new)
+    row, cluster = join_open(point, rows["cluster"], rows["is_core"], rows["is_owned"])
+    return fuse_members({name: values[row] for name, values in rows.items()}, cluster)
+
+
+def fuse_members(rows: Columns, cluster: Ints, *, is_weighted: bool = True, is_medoid: Flags | None = None) -> Columns:
+    """Return one row a cluster; members are put in the order of their keys first.
+
+    Parameters
+    ----------
+    rows
+        Members, (n,) a column.
+    cluster
+        (n,) cluster of each member.
+    is_weighted
+        Whether centroids are weighted by information, or plain means.
+    is_medoid
+        (n,) the members that are the positions of their clusters, one each; None for centroids.
+    """
+    if cluster.size == 0:
+        return {}
+    order = np.lexsort((rows["track_id"], rows["pass_code"], cluster))
+    rows = {name: values[order] for name, values in rows.items()}
+    first = np.append(np.flatnonzero(np.diff(cluster[order], prepend=-1)), cluster.size)
+    lead = first[:-1]
+    weight = information_weights(rows["n_frames"], rows["spread_m2"]) if is_weighted else np.ones(cluster.size)
+    fused = fuse(rows["lon"], rows["lat"], weight=weight, pass_code=rows["pass_code"], first=first)
+    if is_medoid is not None:
+        fused = move_to_members(fused, rows["lon"][is_medoid[order]], rows["lat"][is_medoid[order]])
+    class_code, confidence = vote(rows["class_code"], rows["class_confidence"], first)
+    return {
+        "run_code": rows["run_code"][lead],
+        "hash": hash_members(rows["pass_hash"], rows["track_id"], first),
+        "class_code": class_code,
+        "class_confidence": confidence,
+        "lon": fused.lon_deg,
+        "lat": fused.lat_deg,
+        "var_e_m2": fused.var_e_m2,
+        "var_n_m2": fused.var_n_m2,
+        "cov_en_m2": fused.cov_en_m2,
+        "n_passes": fused.n_passes,
+        "n_detections": fused.n_detections,
+        "t_first_us": np.minimum.reduceat(rows["t_first_us"], lead),
+        "t_last_us": np.maximum.reduceat(rows["t_last_us"], lead),
+    }
+
+
+def concatenate(parts: Sequence[Columns]) -> Columns:
+    """Stack columns; parts without any are skipped."""
+    parts = [part for part in parts if part]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
