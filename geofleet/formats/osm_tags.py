@@ -23,8 +23,11 @@ if TYPE_CHECKING:
 POINT_HIGHWAYS = {"stop": "stop", "give_way": "give_way", "traffic_signals": "traffic_signals"}
 _PLAIN_KEYS = frozenset({"highway", "direction", "city_limit", "traffic_signals:direction"})
 KEY_STARTS = ("traffic_sign", "max", *_PLAIN_KEYS)
-_SIGN_KEY = re.compile(r"traffic_sign(?::(?P<slot>\d+))?(?::(?P<side>forward|backward|both))?")
-_COUNTRY = re.compile(r"(?:([A-Za-z]{2}):\s*(?=\S))?(.*)", re.DOTALL)
+_SIDE = "forward|backward|both|left|right"
+_SIGN_KEY = re.compile(
+    rf"traffic_sign(?::(?P<slot>\d{{1,3}}))?(?::(?P<side>{_SIDE}))?|traffic_sign:(?P<first>{_SIDE}):(?P<then>\d{{1,3}})"
+)
+_COUNTRY = re.compile(r"(?:traffic_sign=)?(?:([A-Za-z]{2})(?:-(?=[A-Z]{2,3}:)|:)\s*(?=\S))?(.*)", re.DOTALL)
 _NUMBER = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*°?\s*")
 _SPEED = re.compile(r"\s*(\d+(?:[.,]\d+)?)\s*(km/h|kmh|kph|mph|knots)?\s*")
 _KMH = {"mph": 1.609344, "knots": 1.852}
@@ -151,7 +154,10 @@ def tagged_signs(tags: Mapping[str, str]) -> list[TaggedSign]:
     for key, value in tags.items():
         match = _SIGN_KEY.fullmatch(key)
         if match:
-            values.append((int(match["slot"] or 1), (match["side"] or "").replace("both", ""), value))
+            side = match["side"] or match["first"] or ""
+            values.append(
+                (int(match["slot"] or match["then"] or 1), side if side in {"forward", "backward"} else "", value)
+            )
     signs = []
     carried = ""
     for slot, side, value in sorted(values):

@@ -27,6 +27,7 @@ OTHER_GROUP = "other"
 NUMBER = r"(?P<value>\d+(?:[.,]\d+)?)"
 _IN_BRACKET = re.compile(r"(?<![\w:])(\d+(?:[.,]\d+)?)\s*(km/h|mph|t|m|%)?(?![\w.:-])")
 _LANELET2 = re.compile(r"([a-z]{2})([A-Z]*\d.*)")
+_REGION = re.compile(r"(?:[A-Z]{2,3}:\s*|§\s*)(?=\S)")  # a state or province, or the sign of a paragraph
 _MAPILLARY_VARIANT = re.compile(r"--g\d+$")
 
 
@@ -175,7 +176,8 @@ def _normalised(code: str, country: str, scheme: str) -> tuple[str, str]:
     match = _LANELET2.fullmatch(code) if scheme == "lanelet2" else None
     if match:
         return match[2].replace("_", "."), match[1].upper()
-    return code, country
+    region = _REGION.match(code) if country and not scheme else None
+    return (code[region.end() :] if region else code), country
 
 
 def _without_bracket(code: str) -> str:

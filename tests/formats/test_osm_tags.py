@@ -33,6 +33,12 @@ def codes(value: str) -> list[str]:
         ("FI:612[a;b];FI:511", ["FI:612[a;b]", "FI:511"]),
         (";FI:331", ["FI:331"]),
         ("BR: R-1", ["BR:R-1"]),
+        ("CA-ON:Ra-1;CA:QC:P-010", ["CA:ON:Ra-1", "CA:QC:P-010"]),  # a province may follow the country
+        ("traffic_sign=BR:A-17", ["BR:A-17"]),  # the key pasted along
+        (
+            "AT:52.11a[52.10a[30];52.7a-2[3.5],54[x]],54[y;z]",
+            ["AT:52.11a[52.10a[30];52.7a-2[3.5],54[x]]", "AT:54[y;z]"],
+        ),
         ("FI:632[FI:811[left];FI:231", ["FI:632[FI:811[left]", "FI:231"]),  # a bracket that never closes holds nothing
         ("city_limit,FR:EB10", ["city_limit", "FR:EB10"]),
         ("", []),
@@ -165,3 +171,44 @@ def test_every_real_value_of_eight_countries_is_read(shared_data):
             assert signs, value
             n += len(signs)
     assert n > 1000
+
+
+CODES = st.from_regex(r"[A-Z]?[0-9]{1,3}([.-][0-9]{1,2})?", fullmatch=True)
+BRACKETS = st.recursive(
+    st.text("abc 0123456789.;,", min_size=1, max_size=8),
+    lambda inner: st.builds(
+        "{}[{}]{}".format, st.sampled_from(["", "FI:672", "up "]), inner, st.sampled_from(["", " x"])
+    ),
+    max_leaves=4,
+)
+PLATES = st.tuples(st.sampled_from(["", "DE", "FI", "BE"]), CODES, st.one_of(st.just(""), BRACKETS))
+
+
+@given(st.lists(st.lists(PLATES, min_size=1, max_size=3), min_size=1, max_size=4))
+def test_a_value_that_is_written_is_read_back(groups):
+    expected = []
+    written = []
+    carried = ""
+    for number, group in enumerate(groups):
+        parts = []
+        for position, (country, code, inside) in enumerate(group):
+            text = f"{code}[{inside}]" if inside else code
+            carried = country or carried
+            parts.append(f"{country}:{text}" if country else text)
+            expected.append((number, position > 0, carried, text))
+        written.append(",".join(parts))
+    assert list(split_value(";".join(written))) == expected
+
+
+@given(st.dictionaries(st.sampled_from(["", ":2", ":3", ":10", ":12", ":forward:4"]), CODES, min_size=1))
+def test_every_slot_is_read_in_the_order_of_its_number(values):
+    number = {"": 1, ":2": 2, ":3": 3, ":10": 10, ":12": 12, ":forward:4": 4}
+    found = tagged_signs({f"traffic_sign{slot}": code for slot, code in values.items()})
+    assert [(sign.slot, sign.code) for sign in found] == sorted((number[slot], code) for slot, code in values.items())
+
+
+def test_the_two_orders_of_slot_and_side_mean_the_same():
+    for key in ("traffic_sign:2:backward", "traffic_sign:backward:2"):
+        assert [(s.slot, s.side) for s in tagged_signs({key: "DE:276"})] == [(2, "backward")]
+    assert [s.side for s in tagged_signs({"traffic_sign:left": "DE:276", "traffic_sign:both": "DE:280"})] == ["", ""]
+    assert tagged_signs({"traffic_sign:id": "x", "traffic_sign:2:direction": "90", "traffic_signals": "yes"}) == []
