@@ -58,6 +58,7 @@ SchemeOption = Annotated[
 CountryOption = Annotated[
     str | None, typer.Option("--country", help="ISO 3166-1 alpha-2 of codes that do not name it.")
 ]
+LayerOption = Annotated[str | None, typer.Option("--layer", help="Layer of a GeoPackage.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="A TOML file of settings.")]
 Scenario = Annotated[str, typer.Option("--scenario", help="Name of a packaged scenario, or a TOML file.")]
@@ -412,6 +413,33 @@ def sql(
         _print_json([dict(zip(names, row, strict=True)) for row in rows])
     else:
         _print_table(names, rows)
+
+
+@app.command()
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="A map, inventory or table.", show_default=False)],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write.", show_default=False)],
+    table: Annotated[str, typer.Option("--table", help="signs or lanes.")] = "signs",
+    file_format: FileFormat = "auto",
+    crs: Crs = None,
+    origin: Origin = None,
+    utm: Utm = None,
+    columns: Columns = None,
+    scheme: SchemeOption = None,
+    country: CountryOption = None,
+    layer: LayerOption = None,
+    roads: Annotated[bool, typer.Option("--roads/--no-roads", help="Infer facing and road from the ways.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Write signs or lanes as .parquet, .geojson, .gpkg, .fgb, .osm or .osc, whatever they come from.
+
+    Example: geofleet convert city.xodr city.geojson
+    """
+    from geofleet.workflows.convert import convert as workflow
+
+    options = {"crs": crs, "origin": _origin(origin), "utm": _utm(utm), "columns": _columns(columns)}
+    options |= {"scheme": scheme, "country": country, "layer": layer, "roads": roads}
+    _report(workflow(source, out, table=table, file_format=file_format, **options), as_json=as_json)
 
 
 @app.command()

@@ -72,6 +72,21 @@ def detect(head: bytes) -> bool:
     return {"x", "y", "time"} <= guessed.keys()
 
 
+def stated_crs(
+    path: Path,
+    *,
+    columns: Mapping[str, str] | Path | None = None,
+    crs: str | None = None,
+    origin: tuple[float, float] | None = None,
+    utm: tuple[str, float, float] | None = None,
+) -> str:
+    """Return the CRS that `read_epochs` takes a file to be in; parameters and errors as there."""
+    layout = _layout(path, columns)
+    if crs is None and origin is None and utm is None:
+        crs, origin = layout.crs, layout.origin
+    return local_crs(crs, origin, utm).crs
+
+
 def read_epochs(
     path: Path,
     *,

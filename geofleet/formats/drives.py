@@ -7,6 +7,7 @@ jumps and what lies inside of a stop are left out and counted, heading and speed
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,11 +15,12 @@ import pyarrow as pa
 
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats import drive_csv, gpx, nmea, rtklib
+from geofleet.formats.datum import datum_of
 from geofleet.formats.drive_quality import judge_epochs
 from geofleet.formats.positions import reject_null_island
 from geofleet.formats.reading import LayerRead, read_head
 from geofleet.tables.schemas import DRIVES, TIME
-from geofleet.tables.store import build_table
+from geofleet.tables.store import build_table, lonlat
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -88,10 +90,12 @@ def read_drive(
     readers: dict[str, Any] = {RTKLIB: rtklib.read_epochs, NMEA: nmea.read_epochs, GPX: gpx.read_epochs}
     if found_format == CSV:
         drives, skipped, found = drive_csv.read_epochs(path, **options)
+        crs = drive_csv.stated_crs(path, **options)
     else:
         epochs, skipped, *notes = readers[found_format](path)
         drives, found = {"": epochs}, notes[0] if notes else {}
-    return _layer(path, found_format, drives, Counter(skipped), Counter(found))
+    layer = _layer(path, found_format, drives, Counter(skipped), Counter(found))
+    return replace(layer, datum=datum_of(crs, *lonlat(layer.table))) if crs else layer
 
 
 def _layer(

@@ -14,10 +14,19 @@ if TYPE_CHECKING:
 _DECIMALS = 8  # a millimetre
 
 
-def write_geojson(frame: GeoDataFrame, path: Path) -> None:
+def write_geojson(frame: GeoDataFrame, path: Path, *, decimals: int = _DECIMALS) -> None:
     """Write a frame in OGC:CRS84 as an RFC 7946 FeatureCollection, atomically.
 
     Ids stay properties (GDAL and QGIS drop integer feature ids). An empty frame gives an empty, valid collection.
+
+    Parameters
+    ----------
+    frame
+        One geometry type.
+    path
+        The file to write.
+    decimals
+        Of the coordinates, degrees.
     """
     import pyogrio  # noqa: PLC0415  (loads GDAL, which only writing needs)
 
@@ -29,5 +38,10 @@ def write_geojson(frame: GeoDataFrame, path: Path) -> None:
             driver="GeoJSON",
             layer=path.stem,  # GDAL would take the draft's name
             geometry_type=geometry_type,
-            layer_options={"RFC7946": "YES", "COORDINATE_PRECISION": str(_DECIMALS), "WRITE_NAME": "YES"},
+            layer_options={
+                "RFC7946": "YES",
+                "COORDINATE_PRECISION": str(decimals),
+                "SIGNIFICANT_FIGURES": "17",  # of other numbers: a double needs as many
+                "WRITE_NAME": "YES",
+            },
         )

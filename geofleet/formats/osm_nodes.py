@@ -25,6 +25,8 @@ PREFIX = "geofleet:"
 _NODE = re.compile(r"node/(-?[1-9]\d{0,17})")
 _NOT_IN_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
+_TINY = 1e-20
+
 Row = dict[str, Any]
 
 
@@ -75,9 +77,10 @@ def sign_nodes(signs: pa.Table) -> list[OsmNode]:
 
 
 def as_text(value: Any) -> str:
-    """Return a value as a tag holds it: numbers in full, without exponent; times in ISO 8601."""
+    """Return a value as a tag holds it: numbers in full, exponents for extremes only; times in ISO 8601."""
     if isinstance(value, float):
-        return str(np.format_float_positional(value, trim="-"))
+        is_plain = value == 0.0 or _TINY < abs(value) < 1.0 / _TINY
+        return str(np.format_float_positional(value, trim="-")) if is_plain else repr(value)
     return value.isoformat() if isinstance(value, datetime) else str(value)
 
 

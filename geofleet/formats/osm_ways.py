@@ -43,14 +43,16 @@ def lane_ways(lanes: pa.Table) -> tuple[list[OsmNode], list[OsmWay]]:
     numbers: dict[tuple[float, float], int] = {}
     ways = []
     shapes = shapely.from_wkb(lanes[GEOMETRY].to_numpy(zero_copy_only=False))
-    for n, (row, shape) in enumerate(zip(lanes.drop_columns([GEOMETRY, BBOX]).to_pylist(), shapes, strict=True), 1):
+    n_new = 0
+    for row, shape in zip(lanes.drop_columns([GEOMETRY, BBOX]).to_pylist(), shapes, strict=True):
         refs = [numbers.setdefault(place, -1 - len(numbers)) for place in map(tuple, shape.coords)]
         tags = {"highway": row["kind"] if row["kind"] in CAR_ROADS else _UNKNOWN_ROAD}
         if row["speed_limit_kmh"] is not None:
             tags["maxspeed"] = as_text(row["speed_limit_kmh"])
         tags |= {f"{PREFIX}{name}": as_text(value) for name, value in row.items() if value is not None and value != ""}
         match = _WAY.fullmatch(row["lane_id"])
-        way_id = int(match[1]) if match else -n
+        n_new += match is None
+        way_id = int(match[1]) if match else -n_new
         ways.append(OsmWay(way_id, refs, checked(tags, where=f"lane {row['lane_id'][:80]}")))
     ways.sort(key=lambda way: (way.way_id > 0, abs(way.way_id)))
     return [OsmNode(number, lon, lat, {}) for (lon, lat), number in numbers.items()], ways
