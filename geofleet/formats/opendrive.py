@@ -259,6 +259,7 @@ def _columns(signals: Mapping[str, Signal], source: str) -> dict[str, Any]:
         "sign_class": [signal.meaning.sign_class for signal in rows],
         "raw_code": [signal.raw_code for signal in rows],
         "country": [signal.country for signal in rows],
+        "country_revision": [signal.country_revision for signal in rows],
         "road_id": [signal.road_id for signal in rows],
         "source": source,
         "source_ref": [f"signal/{signal.signal_id}" for signal in rows],

@@ -88,6 +88,7 @@ class Signal:
     kind: str
     raw_code: str
     country: str | None
+    country_revision: str | None
     meaning: Meaning
     place: Place
     logical: Place
@@ -138,6 +139,7 @@ class SignalReader:
                 "light" if is_light else _kind(code, country, meaning),
                 raw_code,
                 country,
+                element.get("countryRevision", "").strip() or None,
                 meaning,
                 physical or logical,
                 logical,

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     Progress = Callable[[int, int], None]
     Reader = Callable[[Path], LayerRead | LayerStream]
 
+_GLOBAL_IDS = frozenset({"osm", "geofleet"})
+
 
 @dataclass(frozen=True, slots=True)
 class IngestResult:
@@ -245,7 +247,29 @@ def _pieces(schema: Schema, read: list[LayerRead | LayerStream], skipped: Counte
     only = read[0]
     if len(read) == 1 and isinstance(only, LayerStream):
         return only.pieces()
-    return iter([_together(schema, [layer.table for layer in read], skipped)])
+    return iter([_together(schema, _told_apart(schema, read), skipped)])
+
+
+def _told_apart(schema: Schema, read: list[LayerRead | LayerStream]) -> list[pa.Table]:
+    """Return the tables, the ids of files that use the same ones prefixed with the names of the files.
+
+    Ids of OpenStreetMap are unique on Earth: one id twice is one object in two extracts. Elsewhere 1 is the first
+    signal of every file.
+    """
+    tables = [layer.table for layer in read]
+    ids = [name for name in ("sign_id", "parent_id", "lane_id") if name in tables[0].column_names]
+    local = [i for i, layer in enumerate(read) if layer.file_format not in _GLOBAL_IDS]
+    if not ids or schema.key != (ids[0],) or len(local) < 2:  # noqa: PLR2004 - one file has its ids to itself
+        return tables
+    seen = Counter(name for i in local for name in tables[i][ids[0]].to_pylist())
+    for i in local:
+        if any(seen[name] > 1 for name in tables[i][ids[0]].to_pylist()):
+            prefix = f"{tables[i]['source'][0].as_py()}:"
+            for name in ids:
+                at = tables[i].column_names.index(name)
+                prefixed = pc.binary_join_element_wise(prefix, tables[i][name], "")
+                tables[i] = tables[i].set_column(at, tables[i].schema.field(at), prefixed)
+    return tables
 
 
 def _counted(pieces: Iterator[pa.Table], kind: str, kinds: Counter[str]) -> Iterator[pa.Table]:
@@ -256,8 +280,8 @@ def _counted(pieces: Iterator[pa.Table], kind: str, kinds: Counter[str]) -> Iter
 
 
 def _together(schema: Schema, tables: list[pa.Table], skipped: Counter[str]) -> pa.Table:
-    """Concatenate tables; of rows with one key the first stays."""
-    table = sort_by_key(schema, pa.concat_tables(tables))
+    """Concatenate tables (a column that only some have is null in the others); of rows with one key the first stays."""
+    table = sort_by_key(schema, pa.concat_tables(tables, promote_options="default"))
     if table.num_rows < 2:  # noqa: PLR2004 - one row repeats nothing
         return table
     same = np.ones(table.num_rows - 1, bool)

@@ -107,7 +107,9 @@ _FUSED = (
     _c("map_version?", TEXT, "version of the map that the sign belongs to"),
 )
 
-SIGNS = Schema("signs", "a layer of signs from one source", ("sign_id",), _SIGN, "Point", optional=_FUSED)
+_READ = (_c("country_revision?", TEXT, "edition of the country's catalogue of signs that the code is of"),)
+
+SIGNS = Schema("signs", "a layer of signs from one source", ("sign_id",), _SIGN, "Point", optional=(*_READ, *_FUSED))
 
 RUNS = Schema(
     "runs",

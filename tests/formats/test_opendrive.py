@@ -168,6 +168,11 @@ def test_signals_without_a_country_can_be_given_one(signs):
     assert (row["sign_class"], row["country"]) == ("yield", "DE")
 
 
+def test_the_revision_of_the_catalogue_is_kept(signs):
+    assert signs(road(signals=signal(countryRevision="2017")))["1"]["country_revision"] == "2017"
+    assert signs(road(signals=signal()))["1"]["country_revision"] is None
+
+
 @pytest.mark.parametrize(
     ("text", "code"),
     [

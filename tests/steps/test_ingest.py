@@ -81,3 +81,30 @@ def test_what_cannot_be_read_leaves_nothing_behind(raw, tmp_path):
     with pytest.raises(InputError, match=r"cut.osm.pbf: damaged"):
         ingest_signs([good, cut], out)
     assert not out.parent.exists()
+
+
+def test_files_that_use_the_same_ids_lose_nothing(shared_data, tmp_path):
+    drawn = shared_data / "opendrive"
+    both = [
+        drawn / "a9_nord_excerpt_bssd.xodr",
+        drawn / "ingolstadt_cityhall.xodr",
+        drawn / "ingolstadt_cityhall_offset.xodr",
+    ]
+    result = ingest_signs(both, tmp_path / "signs.parquet")
+    assert result.n_rows == 38 + 417 + 417
+    table = read_table(SIGNS, tmp_path / "signs.parquet")
+    parents = set(filter(None, table["parent_id"].to_pylist()))
+    assert parents <= set(table["sign_id"].to_pylist())
+
+
+def test_one_object_in_two_extracts_is_one_row(raw, tmp_path):
+    once = ingest_signs([raw / "helsinki.osm.pbf"], tmp_path / "once.parquet")
+    copy = tmp_path / "copy.osm.pbf"
+    copy.write_bytes((raw / "helsinki.osm.pbf").read_bytes())
+    assert ingest_signs([raw / "helsinki.osm.pbf", copy], tmp_path / "twice.parquet").n_rows == once.n_rows
+
+
+def test_formats_with_columns_of_their_own_go_together(raw, shared_data, tmp_path):
+    drawn = shared_data / "opendrive" / "a9_nord_excerpt_bssd.xodr"
+    result = ingest_signs([raw / "helsinki.osm.pbf", drawn], tmp_path / "signs.parquet")
+    assert result.n_rows == 3489 + 38
