@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from geofleet.formats.osm_rows import SignRows, clean_nodes
-from geofleet.formats.osm_scan import as_pbf, detect, explained, read_roads, refuse_lanelet2, sign_nodes
+from geofleet.formats.osm_scan import detect, read_roads, refuse_lanelet2, scan, sign_nodes
 from geofleet.formats.reading import LayerRead, LayerStream
 from geofleet.tables.schemas import LANES
 from geofleet.tables.store import build_table
@@ -38,9 +38,7 @@ def read_signs(path: Path, *, roads: bool = True) -> LayerStream:
     InputError
         The file is missing, empty, damaged or not OpenStreetMap's.
     """
-    with as_pbf(path) as pbf, explained(path):
-        nodes = sign_nodes(pbf)
-        ways = read_roads(pbf) if roads else None
+    nodes, ways = scan(path, lambda pbf: (sign_nodes(pbf), read_roads(pbf) if roads else None))
     if not len(nodes.node_id):
         refuse_lanelet2(path)
     nodes, skipped = clean_nodes(nodes)
@@ -60,8 +58,7 @@ def read_lanes(path: Path) -> LayerRead:
     InputError
         The file is missing, empty, damaged or not OpenStreetMap's.
     """
-    with as_pbf(path) as pbf, explained(path):
-        ways = read_roads(pbf)
+    ways = scan(path, read_roads)
     if not len(ways.way_id):
         refuse_lanelet2(path)
     columns = {

@@ -149,9 +149,8 @@ class Block:
         """
         _, groups, numbers = self._parts
         for group in groups:
-            number, value = next(
-                _fields(self.data, group), (0, 0)
-            )  # a group holds one kind, and dense nodes are one field
+            # A group holds things of one kind, and dense nodes are one field.
+            number, value = next(_fields(self.data, group), (0, 0))
             if number == 1:
                 raise UnusualPbfError("nodes that are not dense")
             if number == 2 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's

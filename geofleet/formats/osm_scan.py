@@ -10,7 +10,7 @@ import tempfile
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -30,13 +30,14 @@ from geofleet.formats.osm_tags import (
 from geofleet.formats.reading import BZIP2, GZIP, read_head
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
     Ints = NDArray[np.int64]
     RawTags = tuple[bytes, ...]  # key and value in turn
 
+_T = TypeVar("_T")
 _PBF_MARK = b"OSMHeader"
 _MARK_WITHIN = 1024
 _LANELET = re.compile(rb"""v=["']lanelet["']""")
@@ -118,9 +119,8 @@ def detect(head: bytes) -> str:
     return "osm" if b"<osm" in head[:_MARK_WITHIN] else ""
 
 
-@contextmanager
-def as_pbf(path: Path) -> Iterator[Path]:
-    """Yield a file as PBF: itself, or a copy in a temporary folder.
+def scan(path: Path, work: Callable[[Path], _T]) -> _T:
+    """Return what `work` makes of a file as PBF: itself, or a copy of it in a temporary folder.
 
     Raises
     ------
@@ -134,24 +134,16 @@ def as_pbf(path: Path) -> Iterator[Path]:
             where=str(path),
             todo="Give a .osm.pbf, .osm or Overpass .json file; the latter two may be packed (.gz, .bz2).",
         )
-    if found == "pbf" and _is_usual(path):
-        yield path
-        return
-    with tempfile.TemporaryDirectory(prefix="geofleet-") as folder:
-        copy = Path(folder) / "map.osm.pbf"
-        with explained(path):
+    with _explained(path):
+        if found == "pbf":
+            try:
+                return work(path)
+            except UnusualPbfError:
+                pass  # libosmium reads it, and writes what is read here
+        with tempfile.TemporaryDirectory(prefix="geofleet-") as folder:
+            copy = Path(folder) / "map.osm.pbf"
             _rewrite(path, found, copy)
-        with explained(path):
-            yield copy
-
-
-def _is_usual(path: Path) -> bool:
-    """Tell whether a PBF can be read as it is, by its header and first block."""
-    try:
-        next(read_blocks(path, lambda block: [None for _ in block.dense_nodes(tagged=False)]), None)
-    except UnusualPbfError:
-        return False
-    return True
+            return work(copy)
 
 
 def _rewrite(path: Path, found: str, copy: Path) -> None:
@@ -170,7 +162,7 @@ def _rewrite(path: Path, found: str, copy: Path) -> None:
 
 
 @contextmanager
-def explained(path: Path) -> Iterator[None]:
+def _explained(path: Path) -> Iterator[None]:
     """Turn what readers raise on a damaged file into an InputError that names the file asked for."""
     try:
         yield
