@@ -3,6 +3,9 @@
 A scenario is a TOML file with the sections below; it starts from another one (`base`, `paper` unless it says
 otherwise) and overrides what it names. Every default lives in `scenarios/paper.toml` and nowhere else. Key names are
 unique over all sections, so `--set tracker=kalman` needs no section.
+
+Beside the sections stand kinds of sensors in a mixed fleet: `[mixed.NAME]` with the `share` of the vehicles that carry
+it and the keys of `[sensor]` that differ; what the shares leave has `[sensor]` as it stands.
 """
 
 from __future__ import annotations
@@ -10,11 +13,12 @@ from __future__ import annotations
 import difflib
 import hashlib
 import tomllib
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from geofleet.errors import ConfigError
 
@@ -25,10 +29,26 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Rate = Annotated[float, Field(ge=0, le=1)]
 ROOT_SCENARIO = "paper"
+MIXED = "mixed"
+
+
+@dataclass(frozen=True, slots=True)
+class Off:
+    """The value at which an option shapes nothing: left out of the digest, so that runs keep names as options grow."""
+
+    value: Any
 
 
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def options_off(self) -> set[str]:
+        """Return the keys that are at the value that is off."""
+        return {
+            name
+            for name, field in type(self).model_fields.items()
+            if any(isinstance(mark, Off) and mark.value == getattr(self, name) for mark in field.metadata)
+        }
 
 
 class SceneConfig(_Section):
@@ -36,6 +56,9 @@ class SceneConfig(_Section):
 
     corridor_m: Positive
     groups: tuple[str, ...]
+    respect_facing: Annotated[bool, Off(value=False)]
+    billboards_per_km: Annotated[NonNegative, Off(0.0)]
+    billboard_share: Annotated[tuple[Rate, Rate], Off((0.3, 0.6))]
 
 
 class FleetConfig(_Section):
@@ -48,6 +71,11 @@ class FleetConfig(_Section):
     lateral_correlation_m: Positive
     speed_factor_sigma: NonNegative
     headway_s: NonNegative
+    drives: Annotated[Literal["one", "all"], Off("one")]
+    direction: Annotated[Literal["forward", "backward", "both"], Off("forward")]
+    opposite_lane_m: Annotated[float, Field(allow_inf_nan=False), Off(3.5)]
+    frame_rate_hz: Annotated[NonNegative, Off(0.0)]
+    speed_profile: Annotated[Literal["constant", "recorded"], Off("constant")]
 
 
 class SensorConfig(_Section):
@@ -66,17 +94,32 @@ class SensorConfig(_Section):
     semantic_rate: Rate
     semantic_draw: Literal["track", "frame"]
     ghost_rate_per_ha: NonNegative
+    gnss_drift_sigma_m: Annotated[NonNegative, Off(0.0)]
+    gnss_drift_correlation_s: Annotated[Positive, Off(60.0)]
+    wrong_fixes_per_km: Annotated[NonNegative, Off(0.0)]
+    wrong_fix_length_m: Annotated[Positive, Off(50.0)]
+    wrong_fix_sigma_m: Annotated[NonNegative, Off(10.0)]
+    fade_range_m: Annotated[NonNegative, Off(0.0)]
+    fade_width_m: Annotated[Positive, Off(10.0)]
+    occluded_share: Annotated[float, Field(ge=0, lt=1), Off(0.0)]
+    occlusion_frames: Annotated[float, Field(ge=1, allow_inf_nan=False), Off(5.0)]
+    confusion: Annotated[Literal["uniform", "group"], Off("uniform")]
+    confusion_in_group: Annotated[Rate, Off(0.8)]
 
 
 class TrackingConfig(_Section):
     """How a vehicle turns frames into tracks (paper, "Temporal Tracking and Fusion")."""
 
-    tracker: Literal["paper", "ideal"]
+    tracker: Literal["paper", "kalman", "ideal"]
     track_gate_m: Positive
     track_reference: Literal["last", "mean"]
     max_missed_frames: Annotated[int, Field(ge=0)]
     min_track_frames: Annotated[int, Field(ge=1)]
     end_on_leaving_view: bool
+    track_gate_chi2: Annotated[Positive, Off(13.8)]
+    merge_gate_chi2: Annotated[Positive, Off(13.8)]
+    class_error_rate: Annotated[float, Field(gt=0, lt=1), Off(0.05)]
+    send_information: Annotated[bool, Off(value=False)]
 
 
 class AggregateConfig(_Section):
@@ -101,6 +144,13 @@ class EvaluateConfig(_Section):
     match_on: Literal["class", "concept", "none"]
 
 
+class SensorKind(_Section):
+    """A kind of sensor in a mixed fleet: the share of the vehicles that carry it, and the sensor."""
+
+    share: Rate
+    sensor: SensorConfig
+
+
 class Config(_Section):
     """Everything that shapes a study."""
 
@@ -111,10 +161,23 @@ class Config(_Section):
     tracking: TrackingConfig
     aggregate: AggregateConfig
     evaluate: EvaluateConfig
+    mixed: dict[str, SensorKind] = {}
+
+    @model_validator(mode="after")
+    def _shares_are_a_fleet(self) -> Config:
+        total = sum(kind.share for kind in self.mixed.values())
+        if total > 1 + 1e-9:  # shares are written as decimals
+            raise ValueError(f"the shares of [{MIXED}] add up to {total:g}, more than the whole fleet")
+        return self
 
     def digest(self, *sections: str) -> str:
-        """Return 16 hex digits of the SHA-256 of some sections (all by default): what shapes a run or a step."""
-        text = self.model_dump_json(include=set(sections) or None)
+        """Return 16 hex digits of the SHA-256 of some sections (all by default): what shapes a run or a step.
+
+        Options that are off are left out.
+        """
+        off: dict[str, Any] = {name: getattr(self, name).options_off() for name in SECTIONS}
+        off[MIXED] = {name: {"sensor": kind.sensor.options_off()} for name, kind in self.mixed.items()} or True
+        text = self.model_dump_json(include=set(sections) or None, exclude=off)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -151,10 +214,14 @@ def load_config(scenario: str | Path = ROOT_SCENARIO, overrides: Mapping[str, An
     tree = _read(path, seen=())
     pairs = overrides.items() if hasattr(overrides, "items") else (_split_override(text) for text in overrides)
     for key, value in pairs:
-        section, name = _locate(key, where="--set")
-        tree[section][name] = value
+        *place, name = _locate(key, where="--set")
+        _reach(tree, place)[name] = value
+    mixed = {
+        name: {"share": keys.pop("share", None), "sensor": {**tree["sensor"], "sensor_kind": name, **keys}}
+        for name, keys in tree.pop(MIXED, {}).items()
+    }
     try:
-        return Config.model_validate({"scenario": path.stem, **tree})
+        return Config.model_validate({"scenario": path.stem, **tree, MIXED: mixed})
     except ValidationError as error:
         raise ConfigError(*_explain(error, path)) from None
 
@@ -185,12 +252,14 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, dict[str, Any]]:
     tree: dict[str, dict[str, Any]] = (
         _read(_find(base, beside=path), (*seen, path)) if base else {name: {} for name in SECTIONS}
     )
+    for kind, keys in _kinds(own.pop(MIXED, {}), path).items():
+        tree.setdefault(MIXED, {}).setdefault(kind, {}).update(keys)
     for section, keys in own.items():
         if section not in SECTIONS or not isinstance(keys, dict):
             raise ConfigError(
                 f"unknown section or key {section!r}.",
                 where=str(path),
-                todo=f"Sections are {', '.join(SECTIONS)}; keys stand inside them.",
+                todo=f"Sections are {', '.join(SECTIONS)} and {MIXED}.NAME; keys stand inside them.",
             )
         for key, value in keys.items():
             _locate(f"{section}.{key}", where=str(path))
@@ -198,9 +267,28 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, dict[str, Any]]:
     return tree
 
 
-def _locate(key: str, where: str) -> tuple[str, str]:
-    """Return section and name of a key given with or without its section."""
+def _kinds(kinds: Any, path: Path) -> dict[str, dict[str, Any]]:
+    """Check the sensor kinds of a file."""
+    if not isinstance(kinds, dict) or not all(isinstance(keys, dict) for keys in kinds.values()):
+        raise ConfigError(f"[{MIXED}] holds keys.", where=str(path), todo=f"Give each kind a section [{MIXED}.NAME].")
+    for kind, keys in kinds.items():
+        for key in keys:
+            _locate(f"{MIXED}.{kind}.{key}", where=str(path))
+    return kinds
+
+
+def _reach(tree: dict[str, Any], place: list[str]) -> dict[str, Any]:
+    for part in place:
+        tree = tree.setdefault(part, {})
+    return tree
+
+
+def _locate(key: str, where: str) -> tuple[str, ...]:
+    """Return section and name of a key given with or without its section; `mixed`, kind and name of a kind's key."""
     section, _, name = key.rpartition(".")
+    top, _, kind = section.partition(".")
+    if top == MIXED and kind and (name == "share" or name in SensorConfig.model_fields):
+        return MIXED, kind, name
     section = section or _SECTION_OF.get(name, "")
     if section in SECTIONS and name in SECTIONS[section].model_fields:
         return section, name

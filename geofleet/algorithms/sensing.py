@@ -12,12 +12,16 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from geofleet.algorithms.confusion import read_classes
+from geofleet.algorithms.occlusion import occluded
+from geofleet.algorithms.pose_errors import gauss_markov, wrong_fixes
 from geofleet.algorithms.sensing_kernels import in_view
 
 if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
+    from geofleet.algorithms.billboards import Billboards
     from geofleet.algorithms.streams import PassStreams
     from geofleet.algorithms.trajectory import Poses
 
@@ -27,6 +31,8 @@ if TYPE_CHECKING:
 
 GHOST = -1
 """Stands for the sign of a detection that came from none."""
+FIRST_BILLBOARD = -2
+"""Stands for the first billboard; the next ones count downwards."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +59,16 @@ class SensorModel:
         Recognition is drawn once a sign and pass (`track`), or anew for every frame (`frame`).
     ghost_rate_per_ha
         Expected false positives a frame and hectare of the view cone.
+    gnss_drift_sigma_m, gnss_drift_correlation_s
+        Drift of the reported position beside the offset, an axis (`pose_errors.gauss_markov`).
+    wrong_fixes_per_km, wrong_fix_length_m, wrong_fix_sigma_m
+        Episodes of a wrong fix (`pose_errors.wrong_fixes`).
+    fade_range_m, fade_width_m
+        Distance at which detection has fallen to half, and scale of the fall; 0 = it does not fall.
+    occluded_share, occlusion_frames
+        Share of frames in which a sign in view is hidden, and for how many in a row on average (`occlusion.occluded`).
+    confusion
+        P(read class | true class), shape (n, n), instead of `semantic_rate` and any other class alike.
     """
 
     range_m: float
@@ -67,6 +83,16 @@ class SensorModel:
     semantic_rate: float = 1.0
     semantic_draw: Literal["track", "frame"] = "track"
     ghost_rate_per_ha: float = 0.0
+    gnss_drift_sigma_m: float = 0.0
+    gnss_drift_correlation_s: float = 60.0
+    wrong_fixes_per_km: float = 0.0
+    wrong_fix_length_m: float = 50.0
+    wrong_fix_sigma_m: float = 10.0
+    fade_range_m: float = 0.0
+    fade_width_m: float = 10.0
+    occluded_share: float = 0.0
+    occlusion_frames: float = 5.0
+    confusion: Floats | None = None
 
     @property
     def half_fov_rad(self) -> float:
@@ -97,13 +123,19 @@ class SignField:
         How many classes are valid in the scene.
     cell_m
         Width of a cell; `SensorModel.range_m` of the sensors that look at the field may not exceed it.
+    facing_rad
+        The way each sign's face looks, counter-clockwise from east, NaN where unknown, shape (n,). When given, a sign
+        is seen from its front only, and one of unknown facing from everywhere.
     """
 
-    def __init__(self, xy_m: Floats, class_code: Ints, *, n_classes: int, cell_m: float) -> None:
+    def __init__(
+        self, xy_m: Floats, class_code: Ints, *, n_classes: int, cell_m: float, facing_rad: Floats | None = None
+    ) -> None:
         self.xy_m = np.ascontiguousarray(xy_m, dtype=np.float64)
         self.class_code = np.ascontiguousarray(class_code, dtype=np.int64)
         self.n_classes = n_classes
         self.cell_m = cell_m
+        self.facing_rad = facing_rad
         self.origin_xy_m = self.xy_m.min(axis=0)
         column, row = np.floor((self.xy_m - self.origin_xy_m) / cell_m).astype(np.int64).T
         self.shape = (int(row.max()) + 1, int(column.max()) + 1)
@@ -180,7 +212,7 @@ def in_view_of(poses: Poses, signs: SignField, model: SensorModel) -> Sightings:
     """Return the signs in the view cone: d < r and |θ| < FOV/2, both strict, from the true pose (paper, eq. 1)."""
     if model.range_m > signs.cell_m:
         raise ValueError(f"a sensor of {model.range_m} m range needs cells as wide, not {signs.cell_m} m")
-    return Sightings(
+    seen = Sightings(
         *in_view(
             poses.xy_m,
             poses.heading_rad,
@@ -194,6 +226,14 @@ def in_view_of(poses: Poses, signs: SignField, model: SensorModel) -> Sightings:
             model.half_fov_rad,
         )
     )
+    return seen if signs.facing_rad is None else seen.take(_from_front(seen, poses, signs.facing_rad))
+
+
+def _from_front(seen: Sightings, poses: Poses, facing_rad: Floats) -> Flags:
+    """Return which sightings look at the front of a sign: its face looks into the half-plane that the car is in."""
+    to_car_rad = poses.heading_rad[seen.frame] + seen.bearing_rad + np.pi
+    off_rad = facing_rad[seen.sign] - to_car_rad
+    return np.isnan(off_rad) | (np.cos(off_rad) > 0)
 
 
 def draw_calibration(model: SensorModel, rng: Generator) -> Calibration:
@@ -205,15 +245,41 @@ def draw_calibration(model: SensorModel, rng: Generator) -> Calibration:
     )
 
 
-def reported_poses(true: Poses, model: SensorModel, rng: Generator) -> Poses:
-    """Return the poses that the vehicle believes: one offset a axis and one heading error for the whole pass."""
+def reported_poses(true: Poses, model: SensorModel, rng: Generator, drift: Generator | None = None) -> Poses:
+    """Return the poses that the vehicle believes: one offset a axis and one heading error for the whole pass.
+
+    With `drift`, what the model says about drift and wrong fixes is added, drawn from that stream.
+    """
     east_unit, north_unit, heading_unit = rng.standard_normal(3)
     offset_m = model.gnss_sigma_m * np.array([east_unit, north_unit])
     turn_rad = np.deg2rad(model.heading_sigma_deg) * heading_unit
-    return type(true)(true.xy_m + offset_m, true.heading_rad + turn_rad, true.along_m)
+    xy_m = true.xy_m + offset_m
+    if drift is not None and model.gnss_drift_sigma_m > 0:
+        if true.elapsed_s is None:
+            raise ValueError("a drift needs poses with times")
+        sigma_m, correlation_s = model.gnss_drift_sigma_m, model.gnss_drift_correlation_s
+        xy_m = xy_m + gauss_markov(true.elapsed_s, sigma_m=sigma_m, correlation_s=correlation_s, rng=drift)
+    if drift is not None and model.wrong_fixes_per_km > 0:
+        xy_m = xy_m + wrong_fixes(
+            true.along_m,
+            per_km=model.wrong_fixes_per_km,
+            length_m=model.wrong_fix_length_m,
+            sigma_m=model.wrong_fix_sigma_m,
+            rng=drift,
+        )
+    return type(true)(xy_m, true.heading_rad + turn_rad, true.along_m, true.elapsed_s)
 
 
-def keep_detected(n: int, false_negative_rate: float, rng: Generator) -> Flags:
+def miss_rate(range_m: Floats, model: SensorModel) -> Floats | float:
+    """Return the probability that a sign in view is missed: FN, or 1 - (1 - FN) / (1 + exp((d - d_half) / width))."""
+    if model.fade_range_m == 0:
+        return model.false_negative_rate
+    fallen = np.clip((range_m - model.fade_range_m) / model.fade_width_m, None, 700)  # exp stays finite
+    missed: Floats = 1 - (1 - model.false_negative_rate) / (1 + np.exp(fallen))
+    return missed
+
+
+def keep_detected(n: int, false_negative_rate: Floats | float, rng: Generator) -> Flags:
     """Draw which of n signs in view are detected: each is missed with probability FN, independently."""
     return rng.random(n) >= false_negative_rate
 
@@ -266,15 +332,21 @@ def projected(seen: Sightings, reported: Poses) -> tuple[Floats, Floats]:
     return reported.xy_m[seen.frame] + seen.range_m[:, None] * ray, azimuth_rad
 
 
-def sense_pass(true: Poses, signs: SignField, model: SensorModel, streams: PassStreams) -> PassSensing:
-    """Simulate what one pass over true poses detects, frame by frame."""
+def sense_pass(
+    true: Poses, signs: SignField, model: SensorModel, streams: PassStreams, billboards: Billboards | None = None
+) -> PassSensing:
+    """Simulate what one pass over true poses detects, frame by frame.
+
+    Signs and billboards that are hidden are in view: they could have been seen, had nothing stood before them.
+    """
     n_frames = len(true.heading_rad)
     visible = in_view_of(true, signs, model)
-    reported = reported_poses(true, model, streams.pose)
-    kept = keep_detected(len(visible.frame), model.false_negative_rate, streams.frames)
+    reported = reported_poses(true, model, streams.pose, streams.drift)
     calibration = draw_calibration(model, streams.calibration)
-    seen = measured(visible.take(kept), calibration, model, streams.frames)
+    seen = _detected(visible, calibration, model, streams.frames, streams.occlusion)
     class_code = _classes_seen(seen, signs, model, streams.classes)
+    if billboards is not None and len(billboards.share):
+        seen, class_code = _merged(seen, class_code, *_billboards_seen(true, billboards, calibration, model, streams))
     ghost, ghost_class = ghosts(n_frames, n_classes=signs.n_classes, model=model, rng=streams.ghosts)
     if len(ghost_class):
         seen, class_code = _merged(seen, class_code, ghost, ghost_class)
@@ -283,11 +355,41 @@ def sense_pass(true: Poses, signs: SignField, model: SensorModel, streams: PassS
     return PassSensing(visible, detections, reported)
 
 
+def _detected(
+    visible: Sightings, calibration: Calibration, model: SensorModel, frames: Generator, occlusion: Generator
+) -> Sightings:
+    """Return what is measured of the signs in view that are neither missed nor hidden."""
+    kept = keep_detected(len(visible.frame), miss_rate(visible.range_m, model), frames)
+    if model.occluded_share > 0:
+        share, mean_frames = model.occluded_share, model.occlusion_frames
+        kept &= ~occluded(visible.frame, visible.sign, share=share, mean_frames=mean_frames, rng=occlusion)
+    return measured(visible.take(kept), calibration, model, frames)
+
+
+def _billboards_seen(
+    true: Poses, billboards: Billboards, calibration: Calibration, model: SensorModel, streams: PassStreams
+) -> tuple[Sightings, Ints]:
+    """Return what is measured of the billboards that this pass takes for signs, and their classes."""
+    taken = billboards.reported(streams.billboards)
+    if not len(taken):
+        return Sightings(taken, taken, np.empty(0), np.empty(0)), taken
+    field = SignField(billboards.xy_m[taken], taken, n_classes=1, cell_m=model.range_m)
+    visible = in_view_of(true, field, model)
+    seen = _detected(visible, calibration, model, streams.billboards, streams.billboards)
+    number = taken[seen.sign]
+    return Sightings(seen.frame, FIRST_BILLBOARD - number, seen.range_m, seen.bearing_rad), billboards.class_code[
+        number
+    ]
+
+
 def _classes_seen(seen: Sightings, signs: SignField, model: SensorModel, rng: Generator) -> Ints:
     """Return the reported class of each row, drawn once a sign and pass or for every frame."""
     per_frame = model.semantic_draw == "frame"
     true_class = signs.class_code[seen.sign] if per_frame else signs.class_code
-    drawn = recognised(true_class, n_classes=signs.n_classes, semantic_rate=model.semantic_rate, rng=rng)
+    if model.confusion is None:
+        drawn = recognised(true_class, n_classes=signs.n_classes, semantic_rate=model.semantic_rate, rng=rng)
+    else:
+        drawn = read_classes(true_class, model.confusion, rng)
     return drawn if per_frame else drawn[seen.sign]
 
 

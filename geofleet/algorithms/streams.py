@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator, SeedSequence
 
-_CALIBRATION, _POSE, _FRAMES, _CLASSES, _GHOSTS = range(5)
+_CALIBRATION, _POSE, _FRAMES, _CLASSES, _GHOSTS, _CHOICE, _DRIFT, _OCCLUSION, _BILLBOARDS = range(9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +31,14 @@ class PassStreams:
         Recognition.
     ghosts
         False positives.
+    choice
+        Which sensor, drive and direction.
+    drift
+        What the reported position does along the way.
+    occlusion
+        What hides signs for several frames.
+    billboards
+        Which billboards are taken for signs.
     """
 
     calibration: Generator
@@ -38,6 +46,10 @@ class PassStreams:
     frames: Generator
     classes: Generator
     ghosts: Generator
+    choice: Generator
+    drift: Generator
+    occlusion: Generator
+    billboards: Generator
 
 
 def pass_streams(seed: int, *, replicate: int, vehicle: int, pass_number: int = 0) -> PassStreams:
@@ -49,7 +61,16 @@ def pass_streams(seed: int, *, replicate: int, vehicle: int, pass_number: int = 
         frames=_generator(seed, (*of_pass, _FRAMES)),
         classes=_generator(seed, (*of_pass, _CLASSES)),
         ghosts=_generator(seed, (*of_pass, _GHOSTS)),
+        choice=_generator(seed, (*of_pass, _CHOICE)),
+        drift=_generator(seed, (*of_pass, _DRIFT)),
+        occlusion=_generator(seed, (*of_pass, _OCCLUSION)),
+        billboards=_generator(seed, (*of_pass, _BILLBOARDS)),
     )
+
+
+def world_stream(seed: int, *, replicate: int) -> Generator:
+    """Return a fresh generator of what all vehicles of a run meet alike: where the billboards stand."""
+    return _generator(seed, (replicate, _BILLBOARDS))
 
 
 def _generator(seed: int, spawn_key: tuple[int, ...]) -> Generator:

@@ -1,16 +1,19 @@
 """Frames to tracks: the vehicle's own fusion over a pass (paper, "Temporal Tracking and Fusion").
 
-Two trackers give every frame detection a track, `track_paper` and `track_ideal`; `summarise` turns tracks into what
-the vehicle sends. Positions are metres in an ENU frame, angles counter-clockwise from east.
+Three trackers give every frame detection a track: `track_paper`, `track_ideal`, and `track_kalman` (module `kalman`);
+`summarise` turns tracks into what the vehicle sends. Positions are metres in an ENU frame, angles
+counter-clockwise from east.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from geofleet.algorithms.information import Information, PolarNoise, TrackRows, information_form, pass_bias
+from geofleet.algorithms.kalman import track_kalman
 from geofleet.algorithms.sensing import GHOST
 from geofleet.algorithms.tracking_kernels import associate, majority, moments
 
@@ -31,7 +34,8 @@ class TrackerModel:
     Parameters
     ----------
     tracker
-        `paper`: exact Hungarian assignment from frame to frame; `ideal`: one track a sign and pass.
+        `paper`: exact Hungarian assignment from frame to frame; `kalman`: innovation and class, fragments merged;
+        `ideal`: one track a sign and pass.
     track_gate_m
         A detection joins a track only when nearer than this to its reference position (strictly).
     track_reference
@@ -44,9 +48,17 @@ class TrackerModel:
         A track not seen in a frame ends when its reference position is outside the view cone of the reported pose.
     range_m, half_fov_rad
         The view cone.
+    track_gate_chi2, merge_gate_chi2
+        `kalman`: largest χ² (2 degrees of freedom) of a detection that joins a track, and of fragments that merge.
+    class_error_rate
+        `kalman`: how often a frame reads another class than the sign's.
+    send_information
+        Send the information form beside the mean; `kalman` always does.
+    noise
+        What the vehicle knows about its sensor: for `kalman` and for the information form.
     """
 
-    tracker: Literal["paper", "ideal"]
+    tracker: Literal["paper", "kalman", "ideal"]
     track_gate_m: float
     track_reference: Literal["last", "mean"]
     max_missed_frames: int
@@ -54,6 +66,11 @@ class TrackerModel:
     end_on_leaving_view: bool
     range_m: float
     half_fov_rad: float
+    track_gate_chi2: float = 13.8
+    merge_gate_chi2: float = 13.8
+    class_error_rate: float = 0.05
+    send_information: bool = False
+    noise: PolarNoise = field(default_factory=lambda: PolarNoise(0.3, 0.0035, 2.4, 0.021))
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +91,8 @@ class Tracks:
         Class by vote over frames (of equals, the smallest code), and the winner's share of the votes.
     sign
         The sign that most frames came from, `GHOST` when none: truth, never sent.
+    information
+        The tracks in information form, when they are sent like that.
     """
 
     xy_m: Floats
@@ -88,12 +107,28 @@ class Tracks:
     class_code: Ints
     class_confidence: Floats
     sign: Ints
+    information: Information | None = None
 
 
 def track_pass(seen: FrameDetections, reported: Poses, model: TrackerModel) -> Tracks:
     """Track the detections of a pass and return what is sent: tracks of at least `min_track_frames` frames."""
-    track = track_ideal(seen) if model.tracker == "ideal" else track_paper(seen, reported, model)
-    return summarise(seen, track, min_track_frames=model.min_track_frames)
+    if model.tracker == "ideal":
+        track = track_ideal(seen)
+    elif model.tracker == "kalman":
+        track = track_kalman(seen, reported, model)
+    else:
+        track = track_paper(seen, reported, model)
+    tracks = summarise(seen, track, min_track_frames=model.min_track_frames)
+    if model.tracker != "kalman" and not model.send_information:
+        return tracks
+    return replace(tracks, information=_information(seen, reported, track, model))
+
+
+def _information(seen: FrameDetections, reported: Poses, track: Ints, model: TrackerModel) -> Information:
+    """Return the information form of the tracks that are sent, linearised under the bias that the pass shows."""
+    rows = TrackRows.of(track)
+    bias = pass_bias(seen, reported, rows, model.noise)
+    return information_form(seen, reported, rows.at_least(model.min_track_frames), model.noise, bias.mean)
 
 
 def track_paper(seen: FrameDetections, reported: Poses, model: TrackerModel) -> Ints:
@@ -120,8 +155,8 @@ def track_paper(seen: FrameDetections, reported: Poses, model: TrackerModel) -> 
 
 def track_ideal(seen: FrameDetections) -> Ints:
     """Return the track of every detection with identities known: one a sign, one a ghost, numbered by birth."""
-    is_ghost = seen.sign == GHOST
-    identity = np.where(is_ghost, -1 - np.arange(len(seen.sign)), seen.sign)
+    fresh = seen.sign.max(initial=0) + 1 + np.arange(len(seen.sign))
+    identity = np.where(seen.sign == GHOST, fresh, seen.sign)
     _, first, inverse = np.unique(identity, return_index=True, return_inverse=True)
     birth_order = np.empty(len(first), dtype=np.int64)
     birth_order[np.argsort(first)] = np.arange(len(first))

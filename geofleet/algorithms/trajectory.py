@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 MOVING_STEP_M = 0.5
 """Epochs nearer than this to the last one kept are standing still: their noise is no motion and has no heading."""
+CRAWL_MPS = 1.0
+"""A camera at a constant frame rate stands still below this speed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +38,14 @@ class Poses:
         Driving direction, counter-clockwise from east, shape (n,).
     along_m
         Distance driven since the start of the drive, gaps included, shape (n,).
+    elapsed_s
+        Time since the start of the pass, shape (n,), where it is known.
     """
 
     xy_m: Floats
     heading_rad: Floats
     along_m: Floats
+    elapsed_s: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +60,23 @@ class DriveLine:
         Distance from the first point, gaps included, shape (n,).
     starts
         Index of the first point of each segment and, last, the number of points.
+    recorded_s
+        Time of each point since the first, shape (n,), where the drive is dated.
     """
 
     xy_m: Floats
     along_m: Floats
     starts: Ints
+    recorded_s: Floats | None = None
+
+    def backward(self) -> DriveLine:
+        """Return the line driven from its end to its beginning."""
+        times = None if self.recorded_s is None else self.recorded_s[-1] - self.recorded_s[::-1]
+        along = self.along_m[-1] - self.along_m[::-1]
+        return DriveLine(self.xy_m[::-1], along, len(self.xy_m) - self.starts[::-1], times)
 
 
-def drive_line(xy_m: Floats, segment: Ints) -> DriveLine:
+def drive_line(xy_m: Floats, segment: Ints, elapsed_s: Floats | None = None) -> DriveLine:
     """Drop the epochs that stand still and the segments that never move.
 
     Parameters
@@ -71,6 +85,8 @@ def drive_line(xy_m: Floats, segment: Ints) -> DriveLine:
         East and north of every epoch, shape (n, 2), in the order driven.
     segment
         Segment number of every epoch, shape (n,); a gap starts a new one.
+    elapsed_s
+        Time of every epoch since any instant, shape (n,), when the drive is dated.
 
     Raises
     ------
@@ -88,6 +104,7 @@ def drive_line(xy_m: Floats, segment: Ints) -> DriveLine:
     lonely[1:] &= ~same
     lonely[:-1] &= ~same
     points, part = points[~lonely], part[~lonely]
+    times = None if elapsed_s is None else elapsed_s[kept][~lonely]
     if len(points) < 2:  # noqa: PLR2004 - a heading needs two points
         raise InputError(
             f"the drive of {len(xy_m)} epochs has no motion: no two of a segment are {MOVING_STEP_M} m apart.",
@@ -95,7 +112,8 @@ def drive_line(xy_m: Floats, segment: Ints) -> DriveLine:
         )
     steps = np.hypot(*np.diff(points, axis=0).T)
     starts = np.concatenate(([0], np.flatnonzero(np.diff(part)) + 1, [len(points)]))
-    return DriveLine(points, np.concatenate(([0.0], np.cumsum(steps))), starts.astype(np.int64))
+    along = np.concatenate(([0.0], np.cumsum(steps)))
+    return DriveLine(points, along, starts.astype(np.int64), None if times is None else times - times[0])
 
 
 def resample(line: DriveLine, *, spacing_m: float, heading_baseline_m: float) -> Poses:
@@ -125,6 +143,62 @@ def resample(line: DriveLine, *, spacing_m: float, heading_baseline_m: float) ->
     return Poses(_at(line, along), np.arctan2(chord[:, 1], chord[:, 0]), along)
 
 
+def travel_times(line: DriveLine, *, speed_mps: float, recorded: bool) -> Floats:
+    """Return when a pass is at each point of a line, seconds since its start, shape (n,).
+
+    Recorded times where they are wanted, else those of a constant speed.
+
+    Raises
+    ------
+    InputError
+        Recorded times are wanted and the drive has none, or they do not grow.
+    """
+    if not recorded:
+        return line.along_m / speed_mps
+    if line.recorded_s is None:
+        raise InputError("the drive has no times to take the speed from.", todo="Set speed_profile to constant.")
+    if not (np.diff(line.recorded_s) > 0).all():
+        raise InputError(
+            "the times of the drive do not grow, so it has no speed.",
+            todo="Give a drive in the order of its times, or set speed_profile to constant.",
+        )
+    return line.recorded_s
+
+
+def frames_in_time(way: Poses, line: DriveLine, *, times_s: Floats, rate_hz: float) -> Poses:
+    """Return the poses of a way at a constant frame rate, where `resample` placed them at a constant distance.
+
+    Parameters
+    ----------
+    way
+        Poses at small distances along a line, as `resample` and `wander` give them.
+    line
+        The line; no frame lies in a gap between its segments.
+    times_s
+        When the pass is at each point of the line; a standstill gives no frames, and less than `CRAWL_MPS` counts as
+        that speed, for a camera that stands still sends nothing new.
+    rate_hz
+        Frames a second.
+    """
+    moving_s = np.minimum(np.diff(times_s), np.diff(line.along_m) / CRAWL_MPS)
+    clock_s = np.concatenate(([0.0], np.cumsum(moving_s)))
+    along = np.interp(np.arange(0.0, clock_s[-1], 1.0 / rate_hz), clock_s, line.along_m)
+    segment = np.searchsorted(line.along_m[line.starts[:-1]], along, side="right") - 1
+    along = along[along <= line.along_m[line.starts[1:] - 1][segment]]
+    if len(along) < 2:  # noqa: PLR2004 - one frame is no drive
+        raise InputError(
+            f"the drive lasts for less than two frames at {rate_hz:g} Hz.", todo="Set frame_rate_hz higher."
+        )
+    columns = [np.interp(along, way.along_m, values) for values in (*way.xy_m.T, np.unwrap(way.heading_rad))]
+    return Poses(np.column_stack(columns[:2]), columns[2], along, np.interp(along, line.along_m, times_s))
+
+
+def beside(way: Poses, left_m: float) -> Poses:
+    """Return a way shifted to its left: the lane of the other direction, where traffic keeps to the right."""
+    left = np.column_stack((-np.sin(way.heading_rad), np.cos(way.heading_rad)))
+    return Poses(way.xy_m + left_m * left, way.heading_rad, way.along_m, way.elapsed_s)
+
+
 def wander(base: Poses, *, sigma_m: float, correlation_m: float, spacing_m: float, rng: Generator) -> Poses:
     """Return the way of one pass: the base drive with a smooth lateral offset.
 
@@ -142,7 +216,8 @@ def wander(base: Poses, *, sigma_m: float, correlation_m: float, spacing_m: floa
     offset = np.convolve(noise, kernel, mode="valid")
     slope = np.gradient(offset, spacing_m)
     left = np.column_stack((-np.sin(base.heading_rad), np.cos(base.heading_rad)))
-    return Poses(base.xy_m + offset[:, None] * left, base.heading_rad + np.arctan(slope), base.along_m)
+    heading = base.heading_rad + np.arctan(slope)
+    return Poses(base.xy_m + offset[:, None] * left, heading, base.along_m, base.elapsed_s)
 
 
 def _at(line: DriveLine, along_m: Floats) -> Floats:

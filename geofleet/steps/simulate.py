@@ -11,42 +11,51 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
+from zlib import crc32
 
 import numpy as np
 import pyarrow as pa
-import shapely
 
-from geofleet.algorithms.sensing import GHOST, PassSensing, SensorModel, sense_pass
+from geofleet.algorithms.sensing import sense_pass
 from geofleet.algorithms.streams import pass_streams
-from geofleet.algorithms.tracking import TrackerModel, Tracks, track_pass
-from geofleet.algorithms.trajectory import Poses, resample, wander
+from geofleet.algorithms.tracking import track_pass
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats.layers import read_layer
+from geofleet.tables.fleets import Fleet, load_fleet
 from geofleet.tables.manifest import hash_path, write_manifest
-from geofleet.tables.scenes import Drive, Scene, load_drive, pick_scene
-from geofleet.tables.schemas import BBOX, DETECTIONS, GEOMETRY, PASSES, REFERENCE, RUNS, TRUTH
-from geofleet.tables.store import atomic_path, build_table, lonlat, sort_by_key, write_table
+from geofleet.tables.schemas import DETECTIONS, PASSES, REFERENCE, RUNS, TRUTH
+from geofleet.tables.simulated import (
+    PassIds,
+    detections_table,
+    passes_table,
+    reference_table,
+    runs_table,
+    truth_table,
+)
+from geofleet.tables.store import atomic_path, sort_by_key, write_pieces, write_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from numpy.random import Generator
     from numpy.typing import NDArray
 
+    from geofleet.algorithms.billboards import Billboards
     from geofleet.config import Config
     from geofleet.tables.schemas import Schema
 
-    Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
     Progress = Callable[[int, int], None]
 
 VEHICLES_A_PART = 250
 """Vehicles whose tracks are in memory at once, and in one file of `truth`: part of the layout, not a setting."""
+FOLDER_A_VEHICLE = 1000
+"""Up to so many vehicles have a folder of detections each; those of larger fleets share `N_BUCKETS` by hash."""
+N_BUCKETS = 32
 
 _OUTPUTS = {"runs.parquet", "reference.parquet", "passes.parquet", "detections", "truth", "_manifest.json"}
 _LIMITS = {"n_vehicles": (1, 100_000), "n_replicates": (1, 100_000), "seed": (0, 2**63 - 1), "n_workers": (1, 1024)}
-_SHAPING = ("scene", "fleet", "sensor", "tracking")
+_SHAPING = ("scene", "fleet", "sensor", "tracking", "mixed")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,33 +74,24 @@ class SimulateResult:
 
 
 @dataclass(frozen=True, slots=True)
-class _Study:
-    """Everything that the passes of all runs share."""
-
-    config: Config
-    drive: Drive
-    scene: Scene
-    base: Poses
-    sensor: SensorModel
-    tracker: TrackerModel
-
-
-@dataclass(frozen=True, slots=True)
 class _Run:
     """One replicate: what its passes share, and where it is written."""
 
     run_id: str
     seed: int
     replicate: int
+    n_vehicles: int
     folder: Path
+    billboards: Billboards | None
 
 
 @dataclass(frozen=True, slots=True)
 class _PassOutput:
-    """What is left of a pass when its detections are on disk."""
+    """What is left of a pass when it is over; its detections too, unless they are on disk."""
 
     passes: pa.Table
     truth: pa.Table
+    detections: pa.Table | None
     frames_in_view: Ints
     n_frame_detections: int
 
@@ -120,7 +120,7 @@ def simulate(
     out
         Folder to write; an earlier simulation there is replaced.
     config
-        The sections scene, fleet, sensor and tracking are used.
+        The sections scene, fleet, sensor and tracking and the kinds of sensors are used.
     n_vehicles, n_replicates, seed
         Passes a run, number of runs, and the seed of all of them.
     n_workers
@@ -131,38 +131,37 @@ def simulate(
     Raises
     ------
     ConfigError
-        A number is out of range, or the scene has one class and classes are to be confused.
+        A number is out of range, or what is asked for cannot be: see `load_fleet`.
     InputError
         A table cannot be used, no sign is near the drive, the drive does not move, or `out` holds something else.
     """
     _check_numbers(n_vehicles=n_vehicles, n_replicates=n_replicates, seed=seed, n_workers=n_workers)
     _check_out(out)
-    study = _load_study(signs, drive, config)
+    fleet = load_fleet(read_layer(signs).table, drive, source=signs, config=config)
     digest = _digest(config, signs, drive)
     run_ids = tuple(_run_id(config.scenario, seed, replicate, digest) for replicate in range(n_replicates))
-    tally = _Tally(progress or _silent, n_vehicles * n_replicates)
+    tally = _Tally(fleet, progress or _silent, n_vehicles * n_replicates)
     with atomic_path(out) as draft, ThreadPoolExecutor(n_workers) as pool:
         draft.mkdir()
-        references = []
-        for replicate, run_id in enumerate(run_ids):
-            in_view = np.zeros((2, len(study.scene.sign_ids)), dtype=np.int64)
-            for output in _passes_of_run(study, _Run(run_id, seed, replicate, draft), n_vehicles, pool):
-                in_view += np.stack((output.frames_in_view > 0, output.frames_in_view))
-                tally.add(output)
-            references.append(_reference(study.scene, run_id, *in_view))
-        write_table(RUNS, _runs(config, run_ids, seed, n_vehicles, digest), draft / "runs.parquet")
-        write_table(REFERENCE, _together(REFERENCE, references), draft / "reference.parquet")
-        write_table(PASSES, _together(PASSES, tally.passes), draft / "passes.parquet")
+        runs = [
+            _Run(run_id, seed, replicate, n_vehicles, draft, fleet.billboards(seed, replicate))
+            for run_id, replicate in sorted(zip(run_ids, range(n_replicates), strict=True))  # by key
+        ]
+        pieces = (piece for run in runs for piece in _parts_of_run(fleet, run, tally, pool))
+        write_pieces(PASSES, pieces, draft / "passes.parquet")
+        table = runs_table(config, run_ids, seed=seed, n_vehicles=n_vehicles, digest=digest)
+        write_table(RUNS, table, draft / "runs.parquet")
+        write_table(REFERENCE, _together(REFERENCE, tally.references), draft / "reference.parquet")
     result = SimulateResult(
         out=out,
         run_ids=run_ids,
-        n_signs=len(study.scene.sign_ids),
-        n_classes=len(study.scene.classes),
+        n_signs=len(fleet.scene.sign_ids),
+        n_classes=len(fleet.scene.classes),
         n_vehicles=n_vehicles,
         n_passes=tally.n_done,
         n_frame_detections=tally.n_frame_detections,
         n_detections=tally.n_detections,
-        drive_length_m=float(study.drive.line.along_m[-1]),
+        drive_length_m=fleet.length_m,
     )
     _manifest(result, signs, drive, config, seed)
     return result
@@ -171,159 +170,90 @@ def simulate(
 class _Tally:
     """What accumulates over the passes of all runs."""
 
-    def __init__(self, progress: Progress, total: int) -> None:
-        self.passes: list[pa.Table] = []
+    def __init__(self, fleet: Fleet, progress: Progress, total: int) -> None:
+        self.references: list[pa.Table] = []
         self.n_done = self.n_frame_detections = self.n_detections = 0
+        self._scene = fleet.scene
         self._progress, self._total = progress, total
+        self._in_view = np.zeros((2, len(fleet.scene.sign_ids)), dtype=np.int64)
 
     def add(self, output: _PassOutput) -> None:
-        self.passes.append(output.passes)
+        self._in_view += np.stack((output.frames_in_view > 0, output.frames_in_view))
         self.n_frame_detections += output.n_frame_detections
         self.n_detections += output.truth.num_rows
         self.n_done += 1
         self._progress(self.n_done, self._total)
+
+    def close_run(self, run_id: str) -> None:
+        """Keep what the passes of a run had in view, and start anew."""
+        self.references.append(reference_table(self._scene, run_id, *self._in_view))
+        self._in_view[:] = 0
 
 
 def _silent(_done: int, _total: int) -> None:
     """Take the place of a progress callback."""
 
 
-def _passes_of_run(study: _Study, run: _Run, n_vehicles: int, pool: ThreadPoolExecutor) -> Iterator[_PassOutput]:
-    """Simulate one pass a vehicle, in order; `truth` is written part by part."""
-    for part, first in enumerate(range(0, n_vehicles, VEHICLES_A_PART)):
-        truths = []
-        vehicles = range(first, min(first + VEHICLES_A_PART, n_vehicles))
-        for output in pool.map(partial(_simulate_pass, study, run), vehicles):
-            truths.append(output.truth)
-            yield output
-        write_table(
-            TRUTH,
-            _together(TRUTH, truths),
-            _made(run.folder / "truth" / f"run_id={run.run_id}") / f"part-{part}.parquet",
-        )
+def _parts_of_run(fleet: Fleet, run: _Run, tally: _Tally, pool: ThreadPoolExecutor) -> Iterator[pa.Table]:
+    """Simulate one pass a vehicle, in order; write all but `passes`, which is returned part by part."""
+    for part, first in enumerate(range(0, run.n_vehicles, VEHICLES_A_PART)):
+        outputs = []
+        vehicles = range(first, min(first + VEHICLES_A_PART, run.n_vehicles))
+        for output in pool.map(partial(_simulate_pass, fleet, run), vehicles):
+            tally.add(output)
+            outputs.append(output)
+        truth = _together(TRUTH, [output.truth for output in outputs])
+        write_table(TRUTH, truth, _folder(run, "truth") / f"part-{part}.parquet")
+        shared = [output.detections for output in outputs if output.detections is not None]
+        if shared:
+            _write_buckets(_together(DETECTIONS, shared), run, part)
+        yield _together(PASSES, [output.passes for output in outputs])
+    tally.close_run(run.run_id)
 
 
-def _simulate_pass(study: _Study, run: _Run, vehicle: int) -> _PassOutput:
+def _simulate_pass(fleet: Fleet, run: _Run, vehicle: int) -> _PassOutput:
     """Drive, sense, track and write the detections of one pass."""
-    fleet = study.config.fleet
     streams = pass_streams(run.seed, replicate=run.replicate, vehicle=vehicle)
-    true = wander(
-        study.base,
-        sigma_m=fleet.lateral_sigma_m,
-        correlation_m=fleet.lateral_correlation_m,
-        spacing_m=fleet.frame_spacing_m,
-        rng=streams.pose,
-    )
-    times = _frame_times(study, vehicle, streams.pose)
-    sensed = sense_pass(true, study.scene.field, study.sensor, streams)
-    tracks = track_pass(sensed.detections, sensed.reported, study.tracker)
-    ids = {"run_id": run.run_id, "vehicle_id": f"v{vehicle:05d}", "pass_id": f"v{vehicle:05d}-p0"}
-    table = _detections(study, ids, tracks, times)
-    folder = _made(run.folder / "detections" / f"run_id={run.run_id}" / f"vehicle_id={ids['vehicle_id']}")
-    write_table(DETECTIONS, table.drop_columns(list(DETECTIONS.partitions)), folder / "part-0.parquet")
+    drive = fleet.start(vehicle, streams)
+    sensed = sense_pass(drive.true, fleet.scene.field, drive.kind.sensor, streams, run.billboards)
+    tracks = track_pass(sensed.detections, sensed.reported, drive.kind.tracker)
+    ids = PassIds.of(run.run_id, vehicle)
+    table = detections_table(ids, tracks, fleet.scene.classes, fleet.frame, drive.times)
+    if run.n_vehicles <= FOLDER_A_VEHICLE:
+        folder = _folder(run, "detections", f"vehicle_id={ids.vehicle_id}")
+        write_table(DETECTIONS, table.drop_columns(list(DETECTIONS.partitions)), folder / "part-0.parquet")
     return _PassOutput(
-        _pass(study, ids, sensed, times),
-        _truth(study.scene, ids, tracks),
-        np.bincount(sensed.in_view.sign, minlength=len(study.scene.sign_ids)),
+        passes_table(
+            *(ids, sensed.reported, fleet.frame, drive.times),
+            drive_id=drive.way.drive.drive_id,
+            sensor=drive.kind.config,
+            frame_spacing_m=drive.frame_spacing_m
+            if fleet.config.fleet.frame_rate_hz
+            else fleet.config.fleet.frame_spacing_m,
+        ),
+        truth_table(ids, tracks, fleet.scene),
+        None if run.n_vehicles <= FOLDER_A_VEHICLE else table,
+        np.bincount(sensed.in_view.sign, minlength=len(fleet.scene.sign_ids)),
         len(sensed.detections.frame),
     )
 
 
-def _frame_times(study: _Study, vehicle: int, rng: Generator) -> NDArray[np.datetime64] | None:
-    """Return the time of every frame: vehicles start `headway_s` apart; without a dated drive there is none."""
-    fleet = study.config.fleet
-    factor = np.exp(fleet.speed_factor_sigma * rng.standard_normal())
-    if study.drive.t_start is None:
-        return None
-    driven_s = study.base.along_m / (fleet.speed_mps * factor)
-    microseconds = np.rint((vehicle * fleet.headway_s + driven_s) * 1e6).astype("timedelta64[us]")
-    times: NDArray[np.datetime64] = study.drive.t_start + microseconds
-    return times
+def _write_buckets(detections: pa.Table, run: _Run, part: int) -> None:
+    """Write the detections of many vehicles into the buckets that their ids hash to."""
+    vehicles = detections["vehicle_id"].combine_chunks().dictionary_encode()
+    bucket_of = np.array([crc32(name.encode()) % N_BUCKETS for name in vehicles.dictionary.to_pylist()])
+    bucket = bucket_of[vehicles.indices.to_numpy()]
+    plain = detections.drop_columns(["run_id"])
+    for number in np.unique(bucket).tolist():
+        folder = _folder(run, "detections", f"bucket={number:02d}")
+        write_table(DETECTIONS, plain.filter(pa.array(bucket == number)), folder / f"part-{part}.parquet")
 
 
-def _detections(study: _Study, ids: dict[str, str], tracks: Tracks, times: NDArray[np.datetime64] | None) -> pa.Table:
-    return build_table(
-        DETECTIONS,
-        {
-            **ids,
-            "track_id": np.arange(len(tracks.n_frames)),
-            "t_first": None if times is None else times[tracks.frame_first],
-            "t_last": None if times is None else times[tracks.frame_last],
-            "frame_first": tracks.frame_first,
-            "frame_last": tracks.frame_last,
-            "n_frames": tracks.n_frames,
-            "sigma_e_m": tracks.sigma_e_m,
-            "sigma_n_m": tracks.sigma_n_m,
-            "cov_en_m2": tracks.cov_en_m2,
-            "range_mean_m": tracks.range_mean_m,
-            "view_deg": (90.0 - np.rad2deg(tracks.azimuth_rad)) % 360.0,
-            "sign_class": pa.array(study.scene.classes[tracks.class_code], pa.string()),
-            "class_confidence": tracks.class_confidence,
-        },
-        geometry=study.drive.frame.to_lonlat(tracks.xy_m),
-    )
-
-
-def _pass(study: _Study, ids: dict[str, str], sensed: PassSensing, times: NDArray[np.datetime64] | None) -> pa.Table:
-    sensor, fleet = study.config.sensor, study.config.fleet
-    path = shapely.linestrings(np.column_stack(study.drive.frame.to_lonlat(sensed.reported.xy_m)))
-    return build_table(
-        PASSES,
-        {
-            **ids,
-            "sensor_id": f"{ids['vehicle_id']}-s0",
-            "sensor_kind": sensor.sensor_kind,
-            "drive_id": study.drive.drive_id,
-            "t_start": None if times is None else times[:1],
-            "t_end": None if times is None else times[-1:],
-            "range_m": sensor.range_m,
-            "fov_deg": sensor.fov_deg,
-            "frame_spacing_m": fleet.frame_spacing_m,
-            "gnss_sigma_m": sensor.gnss_sigma_m,
-        },
-        geometry=[path],
-    )
-
-
-def _truth(scene: Scene, ids: dict[str, str], tracks: Tracks) -> pa.Table:
-    is_ghost = tracks.sign == GHOST
-    true_code = scene.field.class_code[tracks.sign]  # that of a ghost is masked below
-    return build_table(
-        TRUTH,
-        {
-            "run_id": ids["run_id"],
-            "pass_id": ids["pass_id"],
-            "track_id": np.arange(len(tracks.sign)),
-            "ref_sign_id": pa.array(scene.sign_ids[tracks.sign], pa.string(), mask=is_ghost),
-            "ref_sign_class": pa.array(scene.classes[true_code], pa.string(), mask=is_ghost),
-            "semantic_correct": ~is_ghost & (true_code == tracks.class_code),
-            "is_ghost": is_ghost,
-        },
-    )
-
-
-def _reference(scene: Scene, run_id: str, n_passes: Ints, n_frames: Ints) -> pa.Table:
-    columns = {
-        name: scene.table[name].combine_chunks() for name in scene.table.column_names if name not in (GEOMETRY, BBOX)
-    }
-    counts = {"run_id": run_id, "n_passes_in_view": n_passes, "n_frames_in_view": n_frames}
-    return build_table(REFERENCE, columns | counts, geometry=lonlat(scene.table))
-
-
-def _runs(config: Config, run_ids: tuple[str, ...], seed: int, n_vehicles: int, digest: str) -> pa.Table:
-    return build_table(
-        RUNS,
-        {
-            "run_id": list(run_ids),
-            "scenario": config.scenario,
-            "seed": seed,
-            "replicate": np.arange(len(run_ids)),
-            "n_vehicles": n_vehicles,
-            "tracker": config.tracking.tracker,
-            "upload": "mean",
-            "config_digest": digest,
-        },
-    )
+def _folder(run: _Run, table: str, *partitions: str) -> Path:
+    """Return a folder of a run, made."""
+    folder = run.folder.joinpath(table, f"run_id={run.run_id}", *partitions)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def _manifest(result: SimulateResult, signs: Path, drive: Path, config: Config, seed: int) -> None:
@@ -338,27 +268,6 @@ def _manifest(result: SimulateResult, signs: Path, drive: Path, config: Config, 
             for name in ("n_signs", "n_classes", "n_vehicles", "n_passes", "n_frame_detections", "n_detections")
         },
     )
-
-
-def _load_study(signs: Path, drive: Path, config: Config) -> _Study:
-    sensor = SensorModel(**config.sensor.model_dump(exclude={"sensor_kind"}))
-    road = load_drive(drive)
-    fleet = config.fleet
-    try:
-        base = resample(road.line, spacing_m=fleet.frame_spacing_m, heading_baseline_m=fleet.heading_baseline_m)
-    except InputError as error:
-        raise InputError(error.what, where=str(drive), todo=error.todo) from None
-    layer = read_layer(signs).table
-    scene = pick_scene(layer, road, source=signs, **config.scene.model_dump(), cell_m=sensor.range_m)
-    if len(scene.classes) == 1 and sensor.semantic_rate < 1:
-        raise ConfigError(
-            f"semantic_rate = {sensor.semantic_rate:g} confuses classes, but the scene has only one: "
-            f"{scene.classes[0]}.",
-            where=str(signs),
-            todo="Set semantic_rate to 1, or widen corridor_m or groups.",
-        )
-    tracker = TrackerModel(**config.tracking.model_dump(), range_m=sensor.range_m, half_fov_rad=sensor.half_fov_rad)
-    return _Study(config, road, scene, base, sensor, tracker)
 
 
 def _check_numbers(**numbers: int) -> None:
@@ -394,8 +303,3 @@ def _run_id(scenario: str, seed: int, replicate: int, digest: str) -> str:
 
 def _together(schema: Schema, tables: list[pa.Table]) -> pa.Table:
     return sort_by_key(schema, pa.concat_tables(tables))
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder

@@ -226,16 +226,22 @@ DETECTIONS = Schema(
         _c("class_votes?", pa.map_(TEXT, INT), "frames a class"),
         _c("raw_code?", TEXT, "code as the vehicle reported it"),
         _c("country?", TEXT, "ISO 3166-1 alpha-2"),
-        _c("info_lon?", FLOAT, "origin of the information form, degrees"),
+        _c("info_lon?", FLOAT, "origin of the information form, degrees: where N is linearised"),
         _c("info_lat?", FLOAT, "origin of the information form, degrees"),
         _c(
             "info_matrix?",
             pa.list_(FLOAT, 10),
-            "upper triangle of N over east, north, range bias, bearing bias",
+            "upper triangle, by row, of N = sum of H'WH over frames; east, north, range bias (m), bearing bias (rad)",
         ),
-        _c("info_vector?", pa.list_(FLOAT, 4), "N times the estimate"),
-        _c("info_s0?", FLOAT, "residual sum of squares"),
-        _c("info_dof?", FLOAT, "degrees of freedom of the residual"),
+        _c(
+            "info_vector?",
+            pa.list_(FLOAT, 4),
+            "N times the estimate: east and north from the origin (m), range bias (m), bearing bias (rad)",
+        ),
+        _c(
+            "info_s0?", FLOAT, "least weighted sum of squared residuals, chi-squared when the declared sigmas are right"
+        ),
+        _c("info_dof?", FLOAT, "degrees of freedom of info_s0: two a frame, less the rank of N"),
     ),
     partitions=("run_id", "vehicle_id"),
 )

@@ -1,0 +1,167 @@
+"""A track in information form: what its frames say about the sign's place and about the bias of the pass.
+
+The unknowns of a track are x = (east, north, range bias, bearing bias): the place in the frame of the *reported* poses
+(the true place plus the GNSS offset of the pass, which no single pass can see), in metres, and what the sensor adds to
+every range (metres) and bearing (radians, the heading error with it). A frame at the reported pose q measures
+
+    d = |y - q| + b_r + n_r        a = ∠(y - q) + b_θ + n_θ
+
+and adds HᵀWH to N and HᵀW(z - h + Hx) to r, with W = diag(1/var_r, 1/var_θ) and H at the smoothed place. N and r add
+up: over frames, over tracks that share a bias and over passes. Minimising over x gives Nx = r.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from geofleet.algorithms.information_kernels import locate, normal_equations
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from geofleet.algorithms.sensing import FrameDetections
+    from geofleet.algorithms.trajectory import Poses
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+MIN_FRAMES = 3
+"""Shorter tracks have no say in the bias of their pass: they may be ghosts."""
+N_ROUNDS = 4
+"""Gauss-Newton steps for the bias; two are enough unless the bias is tens of degrees."""
+OUTLIER_SIGMAS = 5.0
+RANK_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True, slots=True)
+class PolarNoise:
+    """What a vehicle knows about its sensor: standard deviations of noise (a frame) and of bias (a pass)."""
+
+    range_sigma_m: float
+    bearing_sigma_rad: float
+    range_bias_sigma_m: float
+    bearing_bias_sigma_rad: float
+
+    @property
+    def bias_cov(self) -> Floats:
+        """Prior covariance of range and bearing bias, shape (2, 2)."""
+        return np.diag([self.range_bias_sigma_m**2, self.bearing_bias_sigma_rad**2])
+
+
+@dataclass(frozen=True, slots=True)
+class PassBias:
+    """Range bias (m) and bearing bias (rad) of a pass, shape (2,), and their covariance, shape (2, 2)."""
+
+    mean: Floats
+    cov: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Information:
+    """Tracks in information form, one row a track.
+
+    Parameters
+    ----------
+    origin_xy_m
+        The smoothed place, where N is linearised and r is counted from, shape (n, 2).
+    matrix
+        N = Σ HᵀWH over east, north, range bias, bearing bias; in m and rad, shape (n, 4, 4).
+    vector
+        r: N times the estimate of (east - origin, north - origin, range bias, bearing bias), shape (n, 4).
+    s0
+        Least weighted sum of squared residuals, χ² with `dof` degrees of freedom when the declared sigmas are right.
+    dof
+        Two a frame, less the rank of N.
+    """
+
+    origin_xy_m: Floats
+    matrix: Floats
+    vector: Floats
+    s0: Floats
+    dof: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class TrackRows:
+    """Detections grouped by track: rows `order[start[t]:start[t + 1]]` are those of track t, by frame."""
+
+    start: Ints
+    order: Ints
+
+    @classmethod
+    def of(cls, track: Ints) -> TrackRows:
+        """Group the rows by the track of each."""
+        n_tracks = int(track.max()) + 1 if len(track) else 0
+        return cls(
+            np.concatenate(([0], np.cumsum(np.bincount(track, minlength=n_tracks)))).astype(np.int64),
+            np.argsort(track, kind="stable"),
+        )
+
+    def at_least(self, n_frames: int) -> TrackRows:
+        """Return the tracks of this many detections or more, in their order."""
+        count = np.diff(self.start)
+        kept = count >= n_frames
+        rows = np.repeat(kept, count)
+        return TrackRows(np.concatenate(([0], np.cumsum(count[kept]))).astype(np.int64), self.order[rows])
+
+
+def information_form(
+    seen: FrameDetections, reported: Poses, rows: TrackRows, noise: PolarNoise, bias: Floats
+) -> Information:
+    """Return N and r of each track, linearised at the place that its frames agree on under a bias of the pass.
+
+    The place is found by Gauss-Newton steps that are damped until the residual falls (Levenberg-Marquardt), from the
+    mean of the reported positions: without damping a track seen from one direction only runs away.
+    """
+    poses = np.ascontiguousarray(reported.xy_m[seen.frame])
+    sigmas = np.array([noise.range_sigma_m, noise.bearing_sigma_rad])
+    place = locate(rows.start, rows.order, seen.xy_m, seen.range_m, seen.azimuth_rad, poses, sigmas, bias)
+    matrix, gradient, square = normal_equations(
+        rows.start, rows.order, seen.range_m, seen.azimuth_rad, poses, sigmas, bias, place
+    )
+    value, axes = np.linalg.eigh(matrix / _scale(noise))  # in sigmas, so that one tolerance fits metres and radians
+    is_seen = value > RANK_TOLERANCE * value[:, -1:]
+    in_axes = np.einsum("tij,ti->tj", axes, gradient / _scale(noise)[0])
+    explained = np.sum(np.where(is_seen, in_axes**2 / np.where(is_seen, value, 1.0), 0.0), axis=1)
+    return Information(
+        origin_xy_m=place,
+        matrix=matrix,
+        vector=gradient + matrix[:, :, 2:] @ bias,
+        s0=np.maximum(square - explained, 0.0),
+        dof=2.0 * np.diff(rows.start) - is_seen.sum(axis=1),
+    )
+
+
+def _scale(noise: PolarNoise) -> Floats:
+    """Return the outer product of what a unit of each unknown is counted in."""
+    unit = np.array([1.0, 1.0, 1.0, noise.bearing_sigma_rad / noise.range_sigma_m])
+    return np.outer(1 / unit, 1 / unit)
+
+
+def pass_bias(seen: FrameDetections, reported: Poses, rows: TrackRows, noise: PolarNoise) -> PassBias:
+    """Return the bias of a pass from its own tracks: b̂ = (P⁻¹ + Σ S)⁻¹ Σ (r_b - N_bp N_pp⁻¹ r_p).
+
+    S = N_bb - N_bp N_pp⁻¹ N_pb is what a track still says about the bias once its own place is solved for. Tracks whose
+    residual is beyond `OUTLIER_SIGMAS` are left out: two signs in one track say nothing about the sensor.
+    """
+    mean, prior = np.zeros(2), noise.bias_cov
+    is_free = np.diag(prior) > 0  # a bias that the vehicle knows to be none stays none
+    long_enough = np.diff(rows.start) >= MIN_FRAMES
+    if not is_free.any() or not long_enough.any():
+        return PassBias(mean, prior)
+    free = np.ix_(is_free, is_free)
+    cov = prior.copy()
+    for _ in range(N_ROUNDS):
+        form = information_form(seen, reported, rows, noise, mean)
+        used = long_enough & (form.s0 <= form.dof + OUTLIER_SIGMAS * np.sqrt(2 * np.maximum(form.dof, 1)))
+        n_pp, n_pb = form.matrix[used, :2, :2], form.matrix[used, :2, 2:]
+        solved = np.linalg.solve(n_pp, np.concatenate((n_pb, form.vector[used, :2, None]), axis=2))
+        schur = (form.matrix[used, 2:, 2:] - np.swapaxes(n_pb, 1, 2) @ solved[:, :, :2]).sum(axis=0)
+        right = (form.vector[used, 2:] - np.einsum("tij,ti->tj", n_pb, solved[:, :, 2])).sum(axis=0)
+        cov = np.zeros((2, 2))
+        cov[free] = np.linalg.inv(np.linalg.inv(prior[free]) + schur[free])
+        mean = cov @ right
+    return PassBias(mean, cov)
