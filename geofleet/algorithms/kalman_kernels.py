@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
 
 LOG_BIRTH_DENSITY = np.log(6e-4)
-    """What the filter assumes: noise, prior of the bias (range m, bearing rad), gate, and how often a class is misread."""
+"""New objects a frame, metre and radian: 0.06 over a cone of 100 m and 60°."""
 VOTES_AWAY = 8
 """Classes that lag behind by more votes weigh nothing."""
 
