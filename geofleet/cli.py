@@ -437,7 +437,7 @@ def convert(
     """
     from geofleet.workflows.convert import convert as workflow
 
-    options = {"crs": crs, "origin": _origin(origin), "utm": _utm(utm), "columns": _columns(columns)}
+    options: dict[str, Any] = {"crs": crs, "origin": _origin(origin), "utm": _utm(utm), "columns": _columns(columns)}
     options |= {"scheme": scheme, "country": country, "layer": layer, "roads": roads}
     _report(workflow(source, out, table=table, file_format=file_format, **options), as_json=as_json)
 
@@ -537,15 +537,14 @@ def _settle(scenario: str | Path, settings: list[str] | None, **options: Any) ->
 @contextmanager
 def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
     """Draw a progress bar on a terminal; elsewhere (CI, a pipe) say on standard error what is being done."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if not sys.stderr.isatty():
         sys.stderr.write(f"{label} ...\n")
         yield lambda _done, _total: None
         return
-    with Progress(console=console, transient=True) as bar:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(label, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 

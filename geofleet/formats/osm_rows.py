@@ -221,7 +221,7 @@ def _mapped_twice(nodes: SignNodes) -> NDArray[np.bool_]:
         tree = shapely.STRtree(shapely.points(_metres(nodes.take(plates))))
         beside = shapely.points(_metres(nodes.take(points)))
         near = tree.query(beside, predicate="dwithin", distance=_MAPPED_TWICE_M)
-        twice[points[np.unique(near[0])]] = True
+        twice[points[near[0]]] = True
     return twice
 
 
