@@ -143,7 +143,7 @@ def kmeans(xy: Floats, k: int) -> Ints:
     It runs on one thread: sums over several are rounded in an order of their own, and labels must not depend on it.
     """
     from sklearn.cluster import KMeans  # noqa: PLC0415  (a second to import, and only this method needs it)
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # noqa: PLC0415  (scikit-learn's)
+    from threadpoolctl import threadpool_limits  # noqa: PLC0415  (scikit-learn's)
 
     with threadpool_limits(limits=1):
         labels: Ints = KMeans(n_clusters=k, n_init=N_STARTS, random_state=SEED).fit_predict(xy)

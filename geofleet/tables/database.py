@@ -6,7 +6,9 @@ variables are not used: DuckDB fills a missing parameter from one silently.
 
 from __future__ import annotations
 
+import os
 import re
+import tempfile
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -45,7 +47,9 @@ def connect(
     QueryError
         The spatial extension is nowhere to be found.
     """
-    config: dict[str, Any] = {"autoinstall_known_extensions": False}
+    # What does not fit in memory goes where temporary files go, not into the user's working folder.
+    spill = Path(tempfile.gettempdir()) / f"geofleet-duckdb-{os.getpid()}"
+    config: dict[str, Any] = {"autoinstall_known_extensions": False, "temp_directory": str(spill)}
     if threads:
         config["threads"] = threads
     if memory_limit:
