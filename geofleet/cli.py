@@ -223,6 +223,9 @@ def simulate(
     replicates: Annotated[int, typer.Option("--replicates", help="Independent repetitions.")] = 1,
     seed: Annotated[int, typer.Option("--seed", help="Of all random numbers.")] = 0,
     corridor_m: Annotated[float | None, typer.Option(help="Signs this near to the drive are the scene.")] = None,
+    respect_facing: Annotated[
+        bool | None, typer.Option("--respect-facing", help="A sign is seen from its front only.")
+    ] = None,
     config: ConfigFile = None,
     settings: Settings = None,
     workers: Workers = N_CORES,
@@ -234,7 +237,7 @@ def simulate(
     """
     from geofleet.steps import simulate as step
 
-    settled = _settle(config or scenario, settings, corridor_m=corridor_m)
+    settled = _settle(config or scenario, settings, corridor_m=corridor_m, respect_facing=respect_facing)
     with _progress("simulating") as progress:
         result = step.simulate(
             signs,

@@ -60,5 +60,5 @@ def _chain(  # noqa: PLR0917 - numba takes no keyword-only arguments
         if last_frame[s] >= 0:
             likely += (state[s] - share) * memory ** (frame[i] - last_frame[s])
         hidden[i] = uniform[i] < likely
-        state[s], last_frame[s] = float(hidden[i]), frame[i]
+        state[s], last_frame[s] = (1.0 if hidden[i] else 0.0), frame[i]
     return hidden

@@ -37,8 +37,9 @@ def wrong_fixes(along_m: Floats, *, per_km: float, length_m: float, sigma_m: flo
     begin = rng.uniform(first, last, n)
     end = begin + rng.exponential(length_m, n)
     jump = sigma_m * rng.standard_normal((n, 2))
-    inside = (along_m[:, None] >= begin) & (along_m[:, None] < end)
-    offset: Floats = inside.astype(np.float64) @ jump
+    offset = np.zeros((len(along_m), 2))
+    for i, j, step in zip(*np.searchsorted(along_m, (begin, end)), jump, strict=True):  # a few a pass
+        offset[i:j] += step
     return offset
 
 

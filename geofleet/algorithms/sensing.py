@@ -341,9 +341,10 @@ def sense_pass(
     """
     n_frames = len(true.heading_rad)
     visible = in_view_of(true, signs, model)
-    reported = reported_poses(true, model, streams.pose, streams.drift)
+    is_steady = model.gnss_drift_sigma_m == model.wrong_fixes_per_km == 0
+    reported = reported_poses(true, model, streams.pose, None if is_steady else streams.drift)
     calibration = draw_calibration(model, streams.calibration)
-    seen = _detected(visible, calibration, model, streams.frames, streams.occlusion)
+    seen = _detected(visible, calibration, model, streams.frames, streams.occlusion if model.occluded_share else None)
     class_code = _classes_seen(seen, signs, model, streams.classes)
     if billboards is not None and len(billboards.share):
         seen, class_code = _merged(seen, class_code, *_billboards_seen(true, billboards, calibration, model, streams))
@@ -356,11 +357,11 @@ def sense_pass(
 
 
 def _detected(
-    visible: Sightings, calibration: Calibration, model: SensorModel, frames: Generator, occlusion: Generator
+    visible: Sightings, calibration: Calibration, model: SensorModel, frames: Generator, occlusion: Generator | None
 ) -> Sightings:
     """Return what is measured of the signs in view that are neither missed nor hidden."""
     kept = keep_detected(len(visible.frame), miss_rate(visible.range_m, model), frames)
-    if model.occluded_share > 0:
+    if occlusion is not None and model.occluded_share > 0:
         share, mean_frames = model.occluded_share, model.occlusion_frames
         kept &= ~occluded(visible.frame, visible.sign, share=share, mean_frames=mean_frames, rng=occlusion)
     return measured(visible.take(kept), calibration, model, frames)

@@ -7,7 +7,7 @@ purpose keeps studies comparable: another ghost rate leaves the GNSS errors of e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.random import Generator, SeedSequence
@@ -15,11 +15,10 @@ from numpy.random import Generator, SeedSequence
 _CALIBRATION, _POSE, _FRAMES, _CLASSES, _GHOSTS, _CHOICE, _DRIFT, _OCCLUSION, _BILLBOARDS = range(9)
 
 
-@dataclass(frozen=True, slots=True)
 class PassStreams:
-    """The generators of one pass.
+    """The generators of one pass, each made when it is first drawn from.
 
-    Parameters
+    Attributes
     ----------
     calibration
         Of the vehicle's sensor: the same for every pass of the vehicle.
@@ -41,37 +40,56 @@ class PassStreams:
         Which billboards are taken for signs.
     """
 
-    calibration: Generator
-    pose: Generator
-    frames: Generator
-    classes: Generator
-    ghosts: Generator
-    choice: Generator
-    drift: Generator
-    occlusion: Generator
-    billboards: Generator
+    def __init__(self, seed: int, replicate: int, vehicle: int, pass_number: int) -> None:
+        self._of_vehicle = partial(_generator, seed, (replicate, vehicle, 0))
+        self._of_pass = partial(_generator, seed, (replicate, vehicle, pass_number))
+
+    @cached_property
+    def calibration(self) -> Generator:  # noqa: D102 - described above, as all of these
+        return self._of_vehicle(_CALIBRATION)
+
+    @cached_property
+    def pose(self) -> Generator:  # noqa: D102
+        return self._of_pass(_POSE)
+
+    @cached_property
+    def frames(self) -> Generator:  # noqa: D102
+        return self._of_pass(_FRAMES)
+
+    @cached_property
+    def classes(self) -> Generator:  # noqa: D102
+        return self._of_pass(_CLASSES)
+
+    @cached_property
+    def ghosts(self) -> Generator:  # noqa: D102
+        return self._of_pass(_GHOSTS)
+
+    @cached_property
+    def choice(self) -> Generator:  # noqa: D102
+        return self._of_pass(_CHOICE)
+
+    @cached_property
+    def drift(self) -> Generator:  # noqa: D102
+        return self._of_pass(_DRIFT)
+
+    @cached_property
+    def occlusion(self) -> Generator:  # noqa: D102
+        return self._of_pass(_OCCLUSION)
+
+    @cached_property
+    def billboards(self) -> Generator:  # noqa: D102
+        return self._of_pass(_BILLBOARDS)
 
 
 def pass_streams(seed: int, *, replicate: int, vehicle: int, pass_number: int = 0) -> PassStreams:
     """Return fresh generators of one pass; equal arguments give equal draws."""
-    of_pass = (replicate, vehicle, pass_number)
-    return PassStreams(
-        calibration=_generator(seed, (replicate, vehicle, 0, _CALIBRATION)),
-        pose=_generator(seed, (*of_pass, _POSE)),
-        frames=_generator(seed, (*of_pass, _FRAMES)),
-        classes=_generator(seed, (*of_pass, _CLASSES)),
-        ghosts=_generator(seed, (*of_pass, _GHOSTS)),
-        choice=_generator(seed, (*of_pass, _CHOICE)),
-        drift=_generator(seed, (*of_pass, _DRIFT)),
-        occlusion=_generator(seed, (*of_pass, _OCCLUSION)),
-        billboards=_generator(seed, (*of_pass, _BILLBOARDS)),
-    )
+    return PassStreams(seed, replicate, vehicle, pass_number)
 
 
 def world_stream(seed: int, *, replicate: int) -> Generator:
     """Return a fresh generator of what all vehicles of a run meet alike: where the billboards stand."""
-    return _generator(seed, (replicate, _BILLBOARDS))
+    return _generator(seed, (replicate,), _BILLBOARDS)
 
 
-def _generator(seed: int, spawn_key: tuple[int, ...]) -> Generator:
-    return Generator(np.random.PCG64(SeedSequence(entropy=seed, spawn_key=spawn_key)))
+def _generator(seed: int, whose: tuple[int, ...], purpose: int) -> Generator:
+    return Generator(np.random.PCG64(SeedSequence(entropy=seed, spawn_key=(*whose, purpose))))
