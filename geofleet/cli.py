@@ -419,6 +419,35 @@ def sql(
 
 
 @app.command()
+def info(
+    files: Inputs,
+    table: Annotated[str, typer.Option("--table", help="auto, signs, lanes, drives or detections.")] = "auto",
+    crs: Crs = None,
+    origin: Origin = None,
+    utm: Utm = None,
+    columns: Columns = None,
+    scheme: SchemeOption = None,
+    country: CountryOption = None,
+    layer: LayerOption = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell what is in files: format, CRS and datum operation, extent, counts, what was skipped and why.
+
+    Example: geofleet info city.xodr drive.pos
+    """
+    from geofleet.workflows.info import info as workflow
+
+    options = {"crs": crs, "origin": _origin(origin), "utm": _utm(utm), "columns": _columns(columns)}
+    options |= {"scheme": scheme, "country": country, "layer": layer}
+    found = [workflow(path, table=table, **options) for path in files]
+    if as_json:
+        _print_json(found[0] if len(found) == 1 else {"files": found})
+        return
+    for one in found:
+        typer.echo("\n".join(one.lines()))
+
+
+@app.command()
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN", help="A map, inventory or table.", show_default=False)],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write.", show_default=False)],

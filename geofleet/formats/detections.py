@@ -18,6 +18,7 @@ import pyarrow.compute as pc
 import shapely
 
 from geofleet.errors import InputError
+from geofleet.formats.datum import datum_of
 from geofleet.formats.detection_columns import (
     FLOATS,
     INTEGERS,
@@ -32,6 +33,7 @@ from geofleet.formats.detection_columns import (
 from geofleet.formats.detection_files import read_batches
 from geofleet.formats.inventory_codes import OSM, guess_country, scheme_of
 from geofleet.formats.positions import country_at, doubts, reject_null_island, to_lonlat
+from geofleet.formats.reading import WGS84
 from geofleet.tables.schemas import DETECTIONS
 from geofleet.tables.store import build_table
 from geofleet.taxonomy import load_taxonomy
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from geofleet.formats.detection_files import Batch
+    from geofleet.formats.reading import Datum
 
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
@@ -63,6 +66,7 @@ class DetectionsRead:
     rejected: pa.Table
     skipped: dict[str, int] = field(default_factory=dict)
     found: dict[str, int] = field(default_factory=dict)
+    datum: Datum = WGS84
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +197,7 @@ def _read(batch: Batch, plan: _Plan, path: Path, found: Counter[str]) -> Detecti
         rejected,
         dict(skipped),
         {name: count for name, count in found.items() if count},
+        datum_of(plan.crs, lon[good], lat[good]),
     )
 
 

@@ -18,7 +18,7 @@ from geofleet.formats import drive_csv, gpx, nmea, rtklib
 from geofleet.formats.datum import datum_of
 from geofleet.formats.drive_quality import judge_epochs
 from geofleet.formats.positions import reject_null_island
-from geofleet.formats.reading import LayerRead, read_head
+from geofleet.formats.reading import Datum, LayerRead, read_head
 from geofleet.tables.schemas import DRIVES, TIME
 from geofleet.tables.store import build_table, lonlat
 
@@ -38,6 +38,11 @@ FORMATS = {
     GPX: "GPX track or route",
     CSV: "CSV or columns of numbers, with a profile or columns named",
 }
+_AS_RECEIVED = Datum(
+    "OGC:CRS84",
+    "none: taken as WGS 84, but corrected positions (RTK, PPP) are in the datum of their base stations, such as ETRS89",
+    None,
+)
 DETECTORS = {RTKLIB: rtklib.detect, GPX: gpx.detect, NMEA: nmea.detect, CSV: drive_csv.detect}
 
 
@@ -95,7 +100,7 @@ def read_drive(
         epochs, skipped, *notes = readers[found_format](path)
         drives, found = {"": epochs}, notes[0] if notes else {}
     layer = _layer(path, found_format, drives, Counter(skipped), Counter(found))
-    return replace(layer, datum=datum_of(crs, *lonlat(layer.table))) if crs else layer
+    return replace(layer, datum=datum_of(crs, *lonlat(layer.table)) if crs else _AS_RECEIVED)
 
 
 def _layer(
