@@ -89,7 +89,7 @@ class Strings:
             else:
                 size, at = _varint(data, at + 1)
                 at += size
-        if at != end or any(data[at] != 0x0A for at in start):  # noqa: PLR2004 - field 1, bytes
+        if at != end or (np.frombuffer(data, np.uint8)[start] != 0x0A).any():  # noqa: PLR2004 - field 1, bytes
             raise DamagedPbfError("a string table with something else in it")
         return cls(data, [*start, at])
 

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Ints = NDArray[np.int64]
-    RawTags = tuple[bytes, ...]  # key and value in turn
 
 _T = TypeVar("_T")
 _PBF_MARK = b"OSMHeader"
@@ -43,6 +42,7 @@ _MARK_WITHIN = 1024
 _LANELET = re.compile(rb"""v=["']lanelet["']""")
 _CHUNK, _OVERLAP = 1 << 20, 64
 _E7 = 1e7
+_TAG_BYTES = 16  # two numbers
 _MAX_E7 = (1_800_000_000, 900_000_000)
 _HIGHWAY = b"\n\x07highway"
 # What a block with signs has in its string table: a key, or a word of `highway` with its length before it.
@@ -95,11 +95,14 @@ class SignNodes:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """Sign nodes of a block: as `SignNodes`, with tag sets of its own; `has_nodes` whether there was any node."""
+    """Sign nodes of a group: id, position, tags of each as numbers of strings, (m, 2), and the strings used."""
 
-    has_nodes: bool
-    groups: list[tuple[Ints, Ints, Ints, list[int]]]
-    tagsets: list[RawTags]
+    node_id: Ints
+    lon_e7: Ints
+    lat_e7: Ints
+    n_tags: Ints
+    tags: Ints
+    used: list[tuple[int, bytes]]
 
 
 def detect(head: bytes) -> str:
@@ -205,19 +208,38 @@ def sign_nodes(pbf: Path) -> SignNodes:
     InputError
         The file is damaged or holds no node at all.
     """
-    tagsets: dict[RawTags, int] = {}
+    known: dict[bytes, int] = {}
+    tagsets: dict[bytes, int] = {}
     columns: list[tuple[Ints, NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]] = []
     has_nodes = False
-    for found in read_blocks(pbf, _signs_in, nodes_only=True):
-        has_nodes |= found.has_nodes
-        number = np.array([tagsets.setdefault(tags, len(tagsets)) for tags in found.tagsets], np.int32)
-        for node_id, lon, lat, own in found.groups:
-            columns.append((node_id, _int32(lon), _int32(lat), number[own]))
+    for groups in read_blocks(pbf, _signs_in, nodes_only=True):
+        has_nodes |= groups is not None
+        for found in groups or ():
+            tagset = _numbered(found, known, tagsets)
+            columns.append((found.node_id, _int32(found.lon_e7), _int32(found.lat_e7), tagset))
     if not has_nodes:
         raise InputError("the file holds no nodes.", where=str(pbf), todo="Check that it is the extract you mean.")
     empty = (np.zeros(0, np.int64), *(np.zeros(0, np.int32) for _ in range(3)))
     node_id, lon32, lat32, tagset = (np.concatenate(column) for column in zip(empty, *columns, strict=True))
-    return SignNodes(node_id, lon32, lat32, tagset, [_tags(raw) for raw in tagsets])
+    return SignNodes(node_id, lon32, lat32, tagset, [_tags(packed, list(known)) for packed in tagsets])
+
+
+def _numbered(found: _Found, known: dict[bytes, int], tagsets: dict[bytes, int]) -> NDArray[np.int32]:
+    """Return the number of each node's set of tags, in what was met so far; every block numbers its strings anew."""
+    number = np.zeros(found.used[-1][0] + 1 if found.used else 0, np.int64)
+    for own, text in found.used:
+        number[own] = known.setdefault(text, len(known))
+    packed = number[found.tags].tobytes()
+    ends = (_TAG_BYTES * np.cumsum(found.n_tags)).tolist()
+    return np.array(
+        [tagsets.setdefault(packed[a:b], len(tagsets)) for a, b in zip([0, *ends], ends, strict=False)], np.int32
+    )
+
+
+def _tags(packed: bytes, strings: list[bytes]) -> dict[str, str]:
+    """Return a set of tags by its numbers."""
+    text = [strings[number].decode(errors="replace") for number in np.frombuffer(packed, np.int64)]
+    return dict(sorted(zip(text[::2], text[1::2], strict=True)))
 
 
 def _int32(e7: Ints) -> NDArray[np.int32]:
@@ -226,25 +248,22 @@ def _int32(e7: Ints) -> NDArray[np.int32]:
     return np.clip(e7, -limit, limit).astype(np.int32)
 
 
-def _signs_in(block: Block) -> _Found:
-    """Return the sign nodes of a block."""
-    if not (block.has_nodes() and any(map(block.holds_string, _MARKS))):
-        return _Found(block.has_nodes(), [], [])
+def _signs_in(block: Block) -> list[_Found] | None:
+    """Return the sign nodes of a block, None when it holds no nodes at all."""
+    if not block.has_nodes():
+        return None
+    if not any(map(block.holds_string, _MARKS)):
+        return []
     strings = block.strings
     key_role, is_word, highway = _roles(strings)
-    tagsets: dict[bytes, int] = {}
     groups = []
-    has_nodes = False
     for nodes in block.dense_nodes():
-        has_nodes |= len(nodes.node_id) > 0
-        if not len(nodes.keys_vals):
-            continue
-        chosen, counts, pairs = _sign_tags(nodes, key_role, is_word, highway)
-        packed = pairs.tobytes()
-        ends = (16 * np.cumsum(counts)).tolist()
-        own = [tagsets.setdefault(packed[a:b], len(tagsets)) for a, b in zip([0, *ends], ends, strict=False)]
-        groups.append((nodes.node_id[chosen], nodes.lon_e7[chosen], nodes.lat_e7[chosen], own))
-    return _Found(has_nodes, groups, [_pairs(packed, strings) for packed in tagsets])
+        if len(nodes.keys_vals):
+            chosen, counts, tags = _sign_tags(nodes, key_role, is_word, highway)
+            used = np.flatnonzero(np.bincount(tags.ravel())).tolist()
+            place = (nodes.node_id[chosen], nodes.lon_e7[chosen], nodes.lat_e7[chosen])
+            groups.append(_Found(*place, counts, tags, [(number, strings[number]) for number in used]))
+    return groups
 
 
 def _roles(strings: Strings) -> tuple[NDArray[np.int8], NDArray[np.bool_], int]:
@@ -281,17 +300,6 @@ def _sign_tags(
     chosen = np.flatnonzero(carries)
     counts = np.bincount(owner[kept], minlength=len(carries))[chosen]
     return chosen, counts, np.column_stack((key[kept], value[kept]))
-
-
-def _pairs(packed: bytes, strings: Strings) -> RawTags:
-    """Return the strings of a packed list of tags."""
-    numbers = np.frombuffer(packed, np.int64).tolist()
-    return tuple([strings[number] for number in numbers])
-
-
-def _tags(raw: RawTags) -> dict[str, str]:
-    text = [part.decode(errors="replace") for part in raw]
-    return dict(sorted(zip(text[::2], text[1::2], strict=True)))
 
 
 def read_roads(pbf: Path) -> Roads:

@@ -275,7 +275,8 @@ def _told_apart(schema: Schema, read: list[LayerRead | LayerStream]) -> list[pa.
 def _counted(pieces: Iterator[pa.Table], kind: str, kinds: Counter[str]) -> Iterator[pa.Table]:
     """Pass tables on, and count what is in a column of theirs."""
     for piece in pieces:
-        kinds.update(piece[kind].to_pylist())
+        counted = pc.value_counts(piece[kind])
+        kinds.update(dict(zip(counted.field("values").to_pylist(), counted.field("counts").to_pylist(), strict=True)))
         yield piece
 
 

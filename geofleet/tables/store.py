@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import uuid
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
@@ -101,7 +102,11 @@ def build_table(
 def sort_by_key(schema: Schema, table: pa.Table) -> pa.Table:
     """Return the rows in the order of the schema's key; files are written in it."""
     keys = [(name, "ascending") for name in schema.key if name in table.column_names]
-    return table.take(pc.sort_indices(table, sort_keys=keys)) if keys else table
+    if not keys:
+        return table
+    order = pc.sort_indices(table, sort_keys=keys)
+    at = np.frombuffer(order.buffers()[1], np.uint64, len(order))  # `to_numpy` would import pandas
+    return table if (at == np.arange(len(at))).all() else table.take(order)
 
 
 def write_table(schema: Schema, table: pa.Table, path: Path) -> None:
@@ -127,12 +132,22 @@ def write_pieces(schema: Schema, pieces: Iterator[pa.Table], path: Path) -> int:
     n_rows = 0
     extents = []
     plain = first.schema.with_metadata({b"geofleet:table": schema.name.encode()})
-    with atomic_path(path) as draft, pq.ParquetWriter(draft, plain, compression=_COMPRESSION) as writer:
+    with (
+        atomic_path(path) as draft,
+        pq.ParquetWriter(draft, plain, compression=_COMPRESSION) as writer,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        writing = None
         for piece in chain((first, second), pieces):
             first = second = None  # what is written need not be held
-            writer.write_table(piece.replace_schema_metadata(plain.metadata))
             n_rows += piece.num_rows
             extents += [extent] if (extent := _extent(piece)) else []
+            if writing:
+                writing.result()
+            # The next piece is made while this one is packed.
+            writing = pool.submit(writer.write_table, piece.replace_schema_metadata(plain.metadata))
+        if writing:
+            writing.result()
         if schema.geometry:
             low, high = np.min(extents, axis=0), np.max(extents, axis=0)
             geo = _geo(schema, [*low[:2].tolist(), *high[2:].tolist()])
