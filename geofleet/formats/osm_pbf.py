@@ -78,20 +78,31 @@ class Strings:
 
     @classmethod
     def of(cls, data: bytes, span: Span) -> Strings:
-        """Find the strings of a table."""
-        at, end = span
-        start = []
-        while at < end:
-            start.append(at)
-            size = data[at + 1]
-            if size < 0x80:  # noqa: PLR2004 - the top bit says that more bytes follow
-                at += size + 2
-            else:
-                size, at = _varint(data, at + 1)
-                at += size
-        if at != end or (np.frombuffer(data, np.uint8)[start] != 0x0A).any():  # noqa: PLR2004 - field 1, bytes
+        """Find the strings of a table.
+
+        Each begins with a newline, as the format happens to have it, and says how long it is; so of all newlines those
+        are beginnings that follow from the first, which doubling steps find: 1, 2, 4, ... strings further.
+        """
+        raw = np.frombuffer(data, np.uint8, span[1] - span[0] + 3, span[0]) if len(data) >= span[1] + 3 else None
+        if raw is None:
+            raw = np.frombuffer(data[slice(*span)] + b"\0\0\0", np.uint8)
+        size = len(raw) - 3
+        at = np.append(np.flatnonzero(raw[:size] == 0x0A), size)  # noqa: PLR2004 - field 1, bytes
+        first, second = raw[at + 1].astype(np.int64), raw[np.minimum(at + 2, size + 2)].astype(np.int64)
+        is_long = first >= 0x80  # noqa: PLR2004 - the top bit says that more bytes follow
+        ends = at + 2 + np.where(is_long, 1 + (first & 0x7F) + (second << 7), first)
+        step = np.searchsorted(at, np.minimum(ends, size))
+        step[-1] = len(at) - 1
+        is_wrong = (at[step] != ends) | (is_long & (second >= 0x80))  # noqa: PLR2004 - as above
+        is_wrong[-1] = False
+        found = np.zeros(1, np.int64)
+        while found[-1] != len(at) - 1:
+            found = np.concatenate((found, step[found]))
+            step = step[step]
+        start = found[: np.searchsorted(found, len(at) - 1) + 1]
+        if is_wrong[start].any() or (size and at[0]):
             raise DamagedPbfError("a string table with something else in it")
-        return cls(data, [*start, at])
+        return cls(data, (at[start] + span[0]).tolist())
 
     def __len__(self) -> int:
         return len(self.start) - 1
