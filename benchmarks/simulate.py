@@ -140,9 +140,7 @@ def compare(fleet: Fleet) -> None:
     with ThreadPoolExecutor(2) as pool:
         two_s = timed(lambda: list(pool.map(lambda _: ours(), range(64)))) / 64
     print(f"  two threads, sense and track         {two_s * 1e3:8.2f} ms   {n / two_s / 1e6:6.3f} M detections/s")
-    print(
-        f"  tracker alone: paper {n / tracker_s / 1e6:.2f} M, kalman {n / kalman_s / 1e6:.3f} M detections/s a core"
-    )
+    print(f"  tracker alone: paper {n / tracker_s / 1e6:.2f} M, kalman {n / kalman_s / 1e6:.3f} M detections/s a core")
 
 
 def whole_step(folder: Path, scenario: str, n_passes: int) -> None:

@@ -590,9 +590,9 @@ def _report(result: Any, *, as_json: bool) -> None:
     width = max(map(len, fields))
     for name, value in fields.items():
         if isinstance(value, dict):
-            value = ", ".join(f"{key}: {number}" for key, number in value.items() if number != 0)  # noqa: PLW2901 (shown as text)
+            value = ", ".join(f"{key}: {number}" for key, number in value.items() if number != 0)  # noqa: PLW2901 (text)
         elif isinstance(value, list | tuple):
-            value = ", ".join(map(str, value))  # noqa: PLW2901 (shown as text)
+            value = ", ".join(map(str, value))  # noqa: PLW2901 (text)
         if value not in ("", None):
             typer.echo(f"  {name.ljust(width)}  {value}")
 
