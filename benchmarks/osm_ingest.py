@@ -135,19 +135,24 @@ def works(name: str, command: list[str], source: Path, folder: Path) -> bool:
 
 
 def run(command: list[str], path: Path, folder: Path) -> tuple[float, float]:
-    """Run a reader on a file; return seconds and peak memory in MB of its process."""
+    """Run a reader on a file; return seconds and peak memory in MB of its process.
+
+    Each has a temporary folder of its own, so that what pyrosm keeps there from one run does not serve the next.
+    """
     out = folder / "out.parquet"
     words = [{"FILE": str(path), "OUT": str(out)}.get(word, word) for word in command]
     # Everybody gets bytecode, as installed packages have it.
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     environment["PYTHONPYCACHEPREFIX"] = str(folder / "bytecode")
-    begin = time.perf_counter()
-    child = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment)  # noqa: S603 - commands from above
-    assert child.stderr is not None
-    said = child.stderr.read()
-    _, status, usage = os.wait4(child.pid, 0)
+    with tempfile.TemporaryDirectory() as temporary:
+        environment["TMPDIR"] = temporary
+        begin = time.perf_counter()
+        child = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment)  # noqa: S603 - commands from above
+        assert child.stderr is not None
+        said = child.stderr.read()
+        _, status, usage = os.wait4(child.pid, 0)
+        seconds = time.perf_counter() - begin
     child.returncode = os.waitstatus_to_exitcode(status)
-    seconds = time.perf_counter() - begin
     if child.returncode:
         raise RuntimeError(said.decode(errors="replace").strip()[-500:])
     return seconds, usage.ru_maxrss / 1024
