@@ -102,11 +102,8 @@ def build_table(
 def sort_by_key(schema: Schema, table: pa.Table) -> pa.Table:
     """Return the rows in the order of the schema's key; files are written in it."""
     keys = [(name, "ascending") for name in schema.key if name in table.column_names]
-    if not keys:
-        return table
-    order = pc.sort_indices(table, sort_keys=keys)
-    at = np.frombuffer(order.buffers()[1], np.uint64, len(order))  # `to_numpy` would import pandas
-    return table if (at == np.arange(len(at))).all() else table.take(order)
+    # `take` copies, also what is in order already: a column may be a view of an array that its owner goes on changing.
+    return table.take(pc.sort_indices(table, sort_keys=keys)) if keys else table
 
 
 def write_table(schema: Schema, table: pa.Table, path: Path) -> None:

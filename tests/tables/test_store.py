@@ -173,3 +173,12 @@ def test_a_manifest_hashes_what_was_read_and_written(tmp_path):
     (out / "x").write_text("c")
     assert write_manifest(out, step="test", inputs=[source]).read_bytes() != first
     assert manifest_path(tmp_path / "signs.parquet").name == "signs_manifest.json"
+
+
+def test_a_table_keeps_its_values_when_the_arrays_it_was_made_of_change():
+    seq, lon = np.arange(3), LON.copy()
+    table = build_table(DRIVES, {"drive_id": "d", "seq": seq, "segment": 0, "source": "x"}, geometry=(lon, LAT))
+    seq[:] = 9
+    lon[:] = 0.0
+    assert table["seq"].to_pylist() == [0, 1, 2]
+    assert lonlat(table)[0].tolist() == LON.tolist()
