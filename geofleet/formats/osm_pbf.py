@@ -1,8 +1,8 @@
 """OpenStreetMap's PBF, read a block at a time: https://wiki.openstreetmap.org/wiki/PBF_Format.
 
-Blocks are unpacked on two threads and decoded as arrays, numbers of a block at once. Blocks that cannot hold what is
-looked for are passed over by a search in their string table, so that a file is read about as fast as it unpacks, and
-memory holds a few blocks whatever its size.
+Blocks are unpacked on threads of their own and decoded as arrays, numbers of a block at once. Blocks that cannot hold
+what is looked for are passed over by a search in their string table, so that a file is read about as fast as it
+unpacks, and memory holds a few blocks whatever its size.
 
 Read are dense nodes and ways in raw or zlib blobs, which is what every usual writer makes. Anything else that the
 format allows raises `UnusualPbfError`; libosmium can rewrite such a file.
@@ -215,15 +215,18 @@ def varints(packed: bytes) -> Ints:
     if len(ends) == len(raw):
         return raw.astype(np.int64)
     starts = np.concatenate(([0], ends[:-1] + 1))
-    sizes = ends - starts + 1
-    if sizes.max() > _MAX_VARINT_BYTES:
+    n_more = ends - starts
+    most = int(n_more.max())
+    if most >= _MAX_VARINT_BYTES:
         raise DamagedPbfError("a number of more than ten bytes")
-    value = (raw[starts] & 0x7F).astype(np.uint64)
-    rows = np.arange(len(starts))
-    for place in range(1, int(sizes.max())):
-        rows = rows[sizes[rows] > place]
-        value[rows] |= (raw[starts[rows] + place] & 0x7F).astype(np.uint64) << np.uint64(7 * place)
-    return value.view(np.int64)
+    kind = np.uint32 if most < 4 else np.uint64  # noqa: PLR2004 - 28 bits in four bytes
+    low = raw & 0x7F
+    value = low[starts].astype(kind)
+    n_more = n_more.astype(np.uint8)
+    for place in range(1, most + 1):
+        rows = np.flatnonzero(n_more >= place)
+        value[rows] |= low[starts[rows] + place].astype(kind) << kind(7 * place)
+    return value.astype(np.uint64).view(np.int64)
 
 
 def deltas(packed: bytes) -> Ints:
@@ -246,20 +249,21 @@ def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = F
         The file is valid and not read here.
     """
     with path.open("rb") as file, ThreadPoolExecutor(_THREADS) as pool:
-        waiting: deque[tuple[int, Future[_T]]] = deque()
+        # Threads unpack only: zlib runs beside Python, while decoding in several threads would wait for the lock.
+        waiting: deque[tuple[int, Future[bytes]]] = deque()
         at = 0
         try:
             for begin, kind, blob in _blobs(file):
                 if kind == b"OSMHeader":
                     _check_features(_unpack(blob))
                 elif kind == b"OSMData":
-                    waiting.append((begin, pool.submit(_worked, blob, work, nodes_only)))
+                    waiting.append((begin, pool.submit(_unpack, blob, nodes_only=nodes_only)))
                 if len(waiting) >= _AHEAD:
                     at, done = waiting.popleft()
-                    yield done.result()
+                    yield work(Block(done.result()))
             while waiting:
                 at, done = waiting.popleft()
-                yield done.result()
+                yield work(Block(done.result()))
         except (DamagedPbfError, zlib.error, IndexError, OverflowError) as error:
             raise InputError(
                 f"damaged, or not an OpenStreetMap file ({error}, at or after byte {at}).",
@@ -269,10 +273,6 @@ def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = F
         finally:
             for _, done in waiting:
                 done.cancel()
-
-
-def _worked(blob: bytes, work: Callable[[Block], _T], nodes_only: bool) -> _T:  # noqa: FBT001 - passed on
-    return work(Block(_unpack(blob, nodes_only=nodes_only)))
 
 
 def _blobs(file: BinaryIO) -> Iterator[tuple[int, bytes, bytes]]:
