@@ -395,7 +395,7 @@ def demo(
         return
     typer.echo(f"\n{result.caption}\n")
     _print_scores(result.totals)
-    typer.echo("\nOpen in QGIS (drag the files in), or look at the picture:")
+    typer.echo("\nLook at the picture, and drag the GeoPackage into QGIS (every layer opens styled):")
     _print_files(result.files)
 
 

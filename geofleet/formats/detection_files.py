@@ -27,7 +27,7 @@ _BLOCK_BYTES = 8 << 20
 _SAMPLE_BYTES = 1 << 20
 _DELIMITERS = ",;\t|"
 _GEOMETRY_NAMES = ("geometry", "geom", "wkb_geometry")
-_TODO = "Fetch or export it again."
+_AGAIN = "Fetch or export it again."
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def read_batches(path: Path) -> Iterator[Batch]:
         yield from readers[found](path)
     except (pa.ArrowException, OSError, ValueError, KeyError, shapely.GEOSException) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"damaged or not {found} ({reason[:300]}).", where=str(path), todo=_TODO) from None
+        raise InputError(f"damaged or not {found} ({reason[:300]}).", where=str(path), todo=_AGAIN) from None
 
 
 def _csv_batches(path: Path) -> Iterator[Batch]:

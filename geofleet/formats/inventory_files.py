@@ -41,7 +41,7 @@ _OPEN_OPTIONS = {"geojson": {"DATE_AS_STRING": "YES"}, "geojsonseq": {"DATE_AS_S
 _MAX_UNPACKED_BYTES = 4 << 30
 _CSV_BLOCK_BYTES = 16 << 20
 _DELIMITERS = ";\t|,"
-_TODO = "Fetch or export it again."
+_AGAIN = "Fetch or export it again."
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ def read_features(
         shapely.GEOSException,
     ) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"damaged or not {found} ({reason[:300]}).", where=str(path), todo=_TODO) from None
+        raise InputError(f"damaged or not {found} ({reason[:300]}).", where=str(path), todo=_AGAIN) from None
     raise InputError(
         "no format of an inventory.",
         where=str(path),
@@ -147,7 +147,7 @@ def _read_gdal(path: Path, found: str, layer: str | None) -> Features:
         except (InputError, ConfigError):
             raise
         except Exception as error:  # noqa: BLE001  (a damaged file makes the binding fail in any way, even by NameError)
-            raise InputError(f"damaged or not {found} ({str(error)[:300]}).", where=str(path), todo=_TODO) from None
+            raise InputError(f"damaged or not {found} ({str(error)[:300]}).", where=str(path), todo=_AGAIN) from None
     name = meta["geometry_name"] or "wkb_geometry"
     notes = {f"GDAL warned: {str(warning.message)[:200]}": 1 for warning in told}
     if n_others:
@@ -174,7 +174,7 @@ def _zipped_shapefile(path: Path) -> str:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
     except (zipfile.BadZipFile, NotImplementedError) as error:
-        raise InputError(f"damaged zip file ({error}).", where=str(path), todo=_TODO) from None
+        raise InputError(f"damaged zip file ({error}).", where=str(path), todo=_AGAIN) from None
     if sum(entry.file_size for entry in entries) > _MAX_UNPACKED_BYTES:
         raise InputError(
             f"the zip file unpacks to more than {_MAX_UNPACKED_BYTES >> 30} GiB.", where=str(path), todo="Unpack it."
@@ -207,7 +207,7 @@ def _layer(source: str, path: Path, layer: str | None) -> tuple[str, int]:
             todo="Name one: layer=.",
         )
     if not names:
-        raise InputError("the file has no layer.", where=str(path), todo=_TODO)
+        raise InputError("the file has no layer.", where=str(path), todo=_AGAIN)
     return (spatial or names)[0], len(names) - 1
 
 

@@ -28,7 +28,15 @@ if TYPE_CHECKING:
 _MARKS: dict[str, dict[str, Any]] = {
     "TP": {"marker": "o", "c": "#009E73", "s": 34, "label": "found (TP)", "zorder": 5},
     "FP": {"marker": "X", "c": "#D55E00", "s": 60, "label": "not in the reference (FP)", "zorder": 7},
-    "FN": {"marker": "D", "facecolors": "none", "edgecolors": "#CC0000", "s": 70, "label": "missed (FN)", "zorder": 6},
+    "FN": {
+        "marker": "D",
+        "facecolors": "none",
+        "edgecolors": "#CC79A7",
+        "linewidths": 2.0,
+        "s": 70,
+        "label": "missed (FN)",
+        "zorder": 6,
+    },
 }
 _MARGIN_M = 60.0
 # No random ids in the SVG: the same run gives the same bytes.

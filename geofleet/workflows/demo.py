@@ -86,6 +86,5 @@ def demo_result(out: Path) -> DemoResult:
         f"{runs[0]['n_vehicles']} simulated vehicles (scenario {runs[0]['scenario']}, tracker {runs[0]['tracker']}, "
         f"upload {runs[0]['upload']}) past real signs of central Helsinki, on a drive derived from the road graph."
     )
-    layers = ("scores", "matches", "match_lines", "fused", "reference")
-    files = (out / "report" / "map.png", *(out / "evaluation" / f"{layer}.geojson" for layer in layers))
+    files = (out / "report" / "map.png", out / "evaluation" / "results.gpkg")
     return DemoResult(caption, tuple(totals), files)
