@@ -16,7 +16,7 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -219,9 +219,9 @@ def varints(packed: bytes) -> Ints:
     most = int(n_more.max())
     if most >= _MAX_VARINT_BYTES:
         raise DamagedPbfError("a number of more than ten bytes")
-    kind = np.uint32 if most < 4 else np.uint64  # noqa: PLR2004 - 28 bits in four bytes
+    kind: Any = np.uint32 if most < 4 else np.uint64  # noqa: PLR2004 - 28 bits in four bytes
     low = raw & 0x7F
-    value = low[starts].astype(kind)
+    value: NDArray[Any] = low[starts].astype(kind)
     n_more = n_more.astype(np.uint8)
     for place in range(1, most + 1):
         rows = np.flatnonzero(n_more >= place)
