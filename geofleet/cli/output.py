@@ -1,0 +1,133 @@
+"""What the commands print: results, tables, scores, JSON; and progress on standard error."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from geofleet.steps.evaluate import EvaluateResult
+
+
+@contextmanager
+def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Draw a progress bar on a terminal; elsewhere (CI, a pipe) say on standard error what is being done."""
+    if not sys.stderr.isatty():
+        sys.stderr.write(f"{label} ...\n")
+        yield lambda _done, _total: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(label, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def print_result(result: Any, *, as_json: bool) -> None:
+    """Print the result of a step: one JSON object, or a line a field; fields that are empty are left out."""
+    fields = asdict(result)
+    if as_json:
+        print_json(fields)
+        return
+    width = max(map(len, fields))
+    for name, value in fields.items():
+        if isinstance(value, dict):
+            value = ", ".join(f"{key}: {number}" for key, number in value.items() if number != 0)  # noqa: PLW2901 (text)
+        elif isinstance(value, list | tuple):
+            value = ", ".join(map(str, value))  # noqa: PLW2901 (text)
+        if value not in ("", None):
+            typer.echo(f"  {name.ljust(width)}  {value}")
+
+
+def print_json(value: Any) -> None:
+    """Print one JSON object."""
+    typer.echo(json.dumps(value, indent=2, default=_plain))
+
+
+def _plain(value: Any) -> Any:
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
+
+
+def print_scores(totals: tuple[dict[str, Any], ...]) -> None:
+    """Print the scores of every run and map, and why one is missing."""
+    names = (
+        "run_id",
+        "method",
+        "n_vehicles",
+        "tp",
+        "fp",
+        "fn",
+        "precision",
+        "recall",
+        "f1",
+        "rmse_m",
+        "gospa",
+        "gospa_m",
+    )
+    print_table(names, [tuple(total[name] for name in names) for total in totals])
+    for total in totals:
+        if total["null_reason"]:
+            typer.echo(f"{total['run_id'] or total['method']}: {total['null_reason']}")
+
+
+def print_evaluation(result: EvaluateResult) -> None:
+    """Print totals, their means when there are several runs, sources when there are several, and what was left out."""
+    print_scores(result.totals)
+    for rows, is_told in ((result.summary, len(result.totals) > 1), (result.sources, bool(result.sources))):
+        if is_told:
+            names = tuple(name for name in rows[0] if name not in ("run_id", "match_on", "gate_m", "null_reason"))
+            typer.echo()
+            print_table(names, [tuple(row[name] for name in names) for row in rows])
+    _print_intervals(result.intervals)
+    _print_comparisons(result.comparisons)
+    for name, number in result.counts.items():
+        if number:
+            typer.echo(f"{name}: {number}")
+    print_files(result.files)
+
+
+def _print_intervals(rows: tuple[dict[str, Any], ...]) -> None:
+    """Say how sure F1 and GOSPA_M are, and of what; all scores stand in intervals.csv."""
+    for row in rows:
+        if row["score"] in ("f1", "gospa_m") and row["low"] is not None:
+            typer.echo(
+                f"{row['score']} {row['estimate']:.4f}, {row['level']:.0%} interval "
+                f"{row['low']:.4f} to {row['high']:.4f}: {row['estimand']}"
+            )
+        elif row["score"] in ("f1", "gospa_m"):
+            typer.echo(f"{row['score']}: no interval: {row['note']}")
+    for note in sorted({row["note"] for row in rows if row["note"] and row["low"] is not None}):
+        typer.echo(f"  beware: {note}")
+
+
+def _print_comparisons(rows: tuple[dict[str, Any], ...]) -> None:
+    """Print the verdict on map A (--map) against map B (--versus), score by score."""
+    names = ("score", "difference", "low", "high", "p_value", "verdict")
+    if rows:
+        typer.echo("\nmap A (--map) minus map B (--versus):")
+        print_table(names, [tuple(row[name] for name in names) for row in rows])
+
+
+def print_files(files: tuple[Path, ...]) -> None:
+    """Print a path a line."""
+    for path in files:
+        typer.echo(f"  {path}")
+
+
+def print_table(names: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
+    """Print left-aligned text and right-aligned numbers, never cut to the width of the terminal."""
+    cells = [[f"{v:.4f}" if isinstance(v, float) else "" if v is None else str(v) for v in row] for row in rows]
+    widths = [max(len(name), *(len(row[i]) for row in cells)) if cells else len(name) for i, name in enumerate(names)]
+    right = [any(isinstance(row[i], int | float) for row in rows) for i in range(len(names))]
+    for row in [list(names), *cells]:
+        aligned = (c.rjust(w) if r else c.ljust(w) for c, w, r in zip(row, widths, right, strict=True))
+        typer.echo("  ".join(aligned).rstrip())

@@ -1,0 +1,201 @@
+"""`geofleet simulate, aggregate, evaluate, report, demo`: the steps after ingest."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from geofleet.cli.options import N_CORES, AsJson, ConfigFile, Out, OutFolder, Scenario, Settings, Workers, settle
+from geofleet.cli.output import print_evaluation, print_files, print_json, print_result, print_scores, progress_bar
+
+app = typer.Typer()
+
+
+@app.command()
+def simulate(
+    signs: Annotated[Path, typer.Option("--signs", help="A signs table.")],
+    drive: Annotated[Path, typer.Option("--drive", help="A drives table.")],
+    out: OutFolder,
+    scenario: Scenario = "paper",
+    vehicles: Annotated[int, typer.Option("--vehicles", help="Size of the fleet.")] = 50,
+    replicates: Annotated[int, typer.Option("--replicates", help="Independent repetitions.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", help="Of all random numbers.")] = 0,
+    corridor_m: Annotated[float | None, typer.Option(help="Signs this near to the drive are the scene.")] = None,
+    respect_facing: Annotated[
+        bool | None, typer.Option("--respect-facing", help="A sign is seen from its front only.")
+    ] = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    workers: Workers = N_CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a fleet that drives past real signs: reference, passes, detections, truth.
+
+    Example: geofleet simulate --signs signs.parquet --drive drives.parquet --vehicles 50 --out simulation
+    """
+    from geofleet.steps import simulate as step
+
+    settled = settle(config or scenario, settings, corridor_m=corridor_m, respect_facing=respect_facing)
+    with progress_bar("simulating") as progress:
+        result = step.simulate(
+            signs,
+            drive,
+            out,
+            config=settled,
+            n_vehicles=vehicles,
+            n_replicates=replicates,
+            seed=seed,
+            n_workers=workers,
+            progress=progress,
+        )
+    print_result(result, as_json=as_json)
+
+
+@app.command()
+def aggregate(
+    detections: Annotated[Path, typer.Option("--detections", help="A detections table or folder.")],
+    out: Out,
+    vehicles: Annotated[int | None, typer.Option("--vehicles", help="Use the first V vehicles only.")] = None,
+    method: Annotated[str | None, typer.Option(help="dbscan, hdbscan, kmeans or kmedoids.")] = None,
+    semantic: Annotated[str | None, typer.Option(help="first or after.")] = None,
+    eps_m: Annotated[float | None, typer.Option(help="Radius of a neighbourhood.")] = None,
+    min_samples: Annotated[int | None, typer.Option(help="Detections that make a core.")] = None,
+    min_cluster_size: Annotated[int | None, typer.Option(help="Detections that make a cluster: hdbscan.")] = None,
+    k: Annotated[int | None, typer.Option("--k", help="Signs of a run: kmeans, kmedoids; 0 = chosen.")] = None,
+    k_from: Annotated[Path | None, typer.Option(help="Reference that tells K (an oracle): kmeans, kmedoids.")] = None,
+    min_support: Annotated[int | None, typer.Option(help="Passes that a sign needs.")] = None,
+    passes: Annotated[Path | None, typer.Option(help="A passes table: support relative to who saw the place.")] = None,
+    tile_zoom: Annotated[int | None, typer.Option(help="Size of the tiles; the result does not depend on it.")] = None,
+    config: ConfigFile = None,
+    scenario: Scenario = "paper",
+    settings: Settings = None,
+    workers: Workers = N_CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Cluster detections per tile and fuse them into a sign map.
+
+    Example: geofleet aggregate --detections simulation/detections --out fused.parquet
+    """
+    from geofleet.steps import aggregate as step
+
+    settled = settle(
+        config or scenario,
+        settings,
+        method=method,
+        semantic=semantic,
+        eps_m=eps_m,
+        min_samples=min_samples,
+        min_cluster_size=min_cluster_size,
+        k=k,
+        min_support=min_support,
+        tile_zoom=tile_zoom,
+    )
+    with progress_bar("aggregating") as progress:
+        result = step.aggregate(
+            detections,
+            out,
+            config=settled,
+            n_vehicles=vehicles,
+            passes=passes,
+            k_from=k_from,
+            n_workers=workers,
+            progress=progress,
+        )
+    print_result(result, as_json=as_json)
+
+
+@app.command()
+def evaluate(
+    map_: Annotated[Path, typer.Option("--map", help="The map to score.")],
+    reference: Annotated[Path, typer.Option("--reference", help="The map to trust.")],
+    out: OutFolder,
+    gate: Annotated[float | None, typer.Option("--gate", help="c: a match is nearer than this, metres.")] = None,
+    match_on: Annotated[str | None, typer.Option(help="class, concept or none.")] = None,
+    clip: Annotated[bool, typer.Option("--clip", help="Score only where both maps have signs.")] = False,
+    clip_m: Annotated[float | None, typer.Option(help="With --clip: as near as this, 100 m if not given.")] = None,
+    in_view: Annotated[bool, typer.Option("--in-view", help="Score only signs that a pass had in view.")] = False,
+    drive: Annotated[Path | None, typer.Option("--drive", help="Drives table: intervals go along it.")] = None,
+    versus: Annotated[Path | None, typer.Option("--versus", help="Another map: is the first one better?")] = None,
+    require: Annotated[list[str] | None, typer.Option(help='Exit 1 when missed: "gospa_m<0.8".')] = None,
+    config: ConfigFile = None,
+    scenario: Scenario = "paper",
+    settings: Settings = None,
+    as_json: AsJson = False,
+) -> None:
+    """Score a sign map against a reference: GOSPA_M, precision, recall, F1.
+
+    Example: geofleet evaluate --map fused.parquet --reference simulation/reference.parquet --out evaluation
+    """
+    from geofleet.steps import evaluate as step
+
+    settled = settle(config or scenario, settings, gate_m=gate, match_on=match_on)
+    requirements = step.parse_requirements(require or [])
+    reach_m = step.CLIP_M if clip and clip_m is None else clip_m
+    result = step.evaluate(
+        map_,
+        reference,
+        out,
+        config=settled,
+        clip_m=reach_m,
+        in_view=in_view,
+        drive_path=drive,
+        versus_path=versus,
+    )
+    missed = step.missed_requirements(result.totals, requirements)
+    if as_json:
+        print_json({**asdict(result), "missed": missed})
+    else:
+        print_evaluation(result)
+    for sentence in missed:
+        sys.stderr.write(f"geofleet: {sentence}\n")
+    if missed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def report(
+    run_dir: Annotated[Path, typer.Argument(help="Folder with signs, lanes, drives, simulation and evaluation.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; RUN_DIR/report by default.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Draw the map of a run with its matches, as PNG and SVG.
+
+    Example: geofleet report data/processed
+    """
+    from geofleet.steps import report as step
+
+    result = step.report(run_dir, out or run_dir / "report")
+    if as_json:
+        print_json(asdict(result))
+    else:
+        print_files(result.files)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="Folder to write.")] = Path("geofleet-demo"),
+    workers: Workers = N_CORES,
+    show: Annotated[bool, typer.Option("--show", help="Only print what a finished demo in --out has found.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run the main job on the shipped data: 50 simulated cars past real signs in Helsinki.
+
+    Example: geofleet demo --out geofleet-demo
+    """
+    from geofleet.workflows import demo as workflow
+
+    if not show:
+        with progress_bar("demo") as progress:
+            workflow.run_demo(out, n_workers=workers, progress=progress)
+    result = workflow.demo_result(out)
+    if as_json:
+        print_json(asdict(result))
+        return
+    typer.echo(f"\n{result.caption}\n")
+    print_scores(result.totals)
+    typer.echo("\nLook at the picture, and drag the GeoPackage into QGIS (every layer opens styled):")
+    print_files(result.files)
