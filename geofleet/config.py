@@ -105,6 +105,8 @@ class SensorConfig(_Section):
     occlusion_frames: Annotated[float, Field(ge=1, allow_inf_nan=False), Off(5.0)]
     confusion: Annotated[Literal["uniform", "group"], Off("uniform")]
     confusion_in_group: Annotated[Rate, Off(0.8)]
+    declares: Annotated[Literal["own", "fleet"], Off("own")]
+    declared_sigma_scale: Annotated[Positive, Off(1.0)]
 
 
 class TrackingConfig(_Section):

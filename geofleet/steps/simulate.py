@@ -227,6 +227,7 @@ def _simulate_pass(fleet: Fleet, run: _Run, vehicle: int) -> _PassOutput:
             *(ids, sensed.reported, fleet.frame, drive.times),
             drive_id=drive.way.drive.drive_id,
             sensor=drive.kind.config,
+            declared=drive.kind.declared,
             frame_spacing_m=drive.frame_spacing_m
             if fleet.config.fleet.frame_rate_hz
             else fleet.config.fleet.frame_spacing_m,

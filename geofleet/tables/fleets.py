@@ -9,12 +9,12 @@ import numpy as np
 
 from geofleet.algorithms.billboards import Billboards, place_billboards
 from geofleet.algorithms.confusion import confusion_matrix
-from geofleet.algorithms.information import PolarNoise
 from geofleet.algorithms.sensing import SensorModel
 from geofleet.algorithms.streams import world_stream
 from geofleet.algorithms.tracking import TrackerModel
 from geofleet.algorithms.trajectory import Poses, beside, frames_in_time, resample, travel_times, wander
 from geofleet.errors import ConfigError, InputError
+from geofleet.tables.declared import Declared
 from geofleet.tables.scenes import Drive, Scene, load_drive, load_drives, pick_scene
 
 if TYPE_CHECKING:
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-LEAST_RANGE_SIGMA_M, LEAST_BEARING_SIGMA_DEG = 0.05, 0.05
-"""No vehicle trusts a frame more than this, also where a study sets its noise to none."""
+_NOT_OF_THE_MODEL = {"sensor_kind", "confusion", "confusion_in_group", "declares", "declared_sigma_scale"}
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of sensor: the share of the vehicles up to and with it, its settings, its model and its tracker."""
+    """A kind of sensor: the share of the vehicles up to and with it, its settings, what it declares, its models."""
 
     upto_share: float
     config: SensorConfig
+    declared: Declared
     sensor: SensorModel
     tracker: TrackerModel
 
@@ -196,26 +196,16 @@ def _kind(upto_share: float, config: SensorConfig, scene: Scene, study: Config) 
         confusion = confusion_matrix(
             scene.groups.tolist(), semantic_rate=config.semantic_rate, in_group=config.confusion_in_group
         )
-    values = config.model_dump(exclude={"sensor_kind", "confusion", "confusion_in_group"})
+    values = config.model_dump(exclude=_NOT_OF_THE_MODEL)
     sensor = SensorModel(**values, confusion=confusion)
+    declared = Declared.by(config, study.sensor)
     tracker = TrackerModel(
         **study.tracking.model_dump(),
         range_m=sensor.range_m,
         half_fov_rad=sensor.half_fov_rad,
-        noise=_declared_noise(sensor),
+        noise=declared.noise,
     )
-    return Kind(upto_share, config, sensor, tracker)
-
-
-def _declared_noise(sensor: SensorModel) -> PolarNoise:
-    """Return what a vehicle knows about its sensor; an error of the heading turns all bearings of a pass alike."""
-    bearing_bias_deg = np.hypot(sensor.bearing_bias_sigma_deg, sensor.heading_sigma_deg)
-    return PolarNoise(
-        max(sensor.range_noise_sigma_m, LEAST_RANGE_SIGMA_M),
-        float(np.deg2rad(max(sensor.bearing_noise_sigma_deg, LEAST_BEARING_SIGMA_DEG))),
-        sensor.range_bias_sigma_m,
-        float(np.deg2rad(bearing_bias_deg)),
-    )
+    return Kind(upto_share, config, declared, sensor, tracker)
 
 
 def _directions(drive: Drive, fleet: FleetConfig) -> tuple[Way, ...]:

@@ -193,6 +193,18 @@ PASSES = Schema(
         _c("gnss_sigma_m?", FLOAT, "standard deviation a axis of the reported path, as declared by the car"),
     ),
     "LineString",
+    optional=(
+        _c("range_bias_sigma_m?", FLOAT, "declared standard deviation of what the sensor adds to every range"),
+        _c(
+            "bearing_bias_sigma_deg?",
+            FLOAT,
+            "declared standard deviation of what sensor and heading add to every bearing of the pass",
+        ),
+        _c("range_noise_sigma_m?", FLOAT, "declared standard deviation of a range, a frame"),
+        _c("bearing_noise_sigma_deg?", FLOAT, "declared standard deviation of a bearing, a frame"),
+        _c("false_negative_rate?", FLOAT, "declared probability that a frame misses a sign in view"),
+        _c("semantic_rate?", FLOAT, "declared probability that a class is recognised"),
+    ),
 )
 
 DETECTIONS = Schema(

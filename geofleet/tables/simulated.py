@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from geofleet.algorithms.tracking import Tracks
     from geofleet.algorithms.trajectory import Poses
     from geofleet.config import Config, SensorConfig
+    from geofleet.tables.declared import Declared
     from geofleet.tables.scenes import Scene
 
     Floats = NDArray[np.float64]
@@ -91,9 +92,10 @@ def passes_table(
     *,
     drive_id: str,
     sensor: SensorConfig,
+    declared: Declared,
     frame_spacing_m: float,
 ) -> pa.Table:
-    """Return the row of a pass: the way that it believes it drove, and what its sensor can see."""
+    """Return the row of a pass: the way that it believes it drove, what its sensor can see, and what it declares."""
     path = shapely.linestrings(np.column_stack(frame.to_lonlat(reported.xy_m)))
     return build_table(
         PASSES,
@@ -109,7 +111,7 @@ def passes_table(
             "range_m": sensor.range_m,
             "fov_deg": sensor.fov_deg,
             "frame_spacing_m": frame_spacing_m,
-            "gnss_sigma_m": sensor.gnss_sigma_m,
+            **asdict(declared),
         },
         geometry=[path],
     )

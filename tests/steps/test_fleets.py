@@ -8,6 +8,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
+import shapely
+from scipy import stats
 
 from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.config import load_config
@@ -177,3 +179,74 @@ def test_large_fleets_share_buckets_and_give_the_same_map(signs, tmp_path, monke
     for name in ("folders", "buckets"):
         aggregate(tmp_path / name / "detections", tmp_path / f"{name}.parquet", config=load_config())
     assert read_table(SIGNS, tmp_path / "folders.parquet").equals(read_table(SIGNS, tmp_path / "buckets.parquet"))
+
+
+DECLARED = {
+    "gnss_sigma_m": 1.7,
+    "range_bias_sigma_m": 2.4,
+    "bearing_bias_sigma_deg": 1.2,
+    "range_noise_sigma_m": 0.3,
+    "bearing_noise_sigma_deg": 0.2,
+}
+
+
+def declared(out, kind):
+    passes = read_table(PASSES, out / "passes.parquet")
+    rows = passes.filter(pc.equal(passes["sensor_kind"], kind)).select([*DECLARED, "false_negative_rate"]).to_pylist()
+    assert rows
+    assert all(row == rows[0] for row in rows)
+    return rows[0]
+
+
+def test_passes_say_what_the_vehicle_declares_and_a_scale_misstates_sigmas_alone(signs, tmp_path):
+    drive = write_drives(tmp_path / "drive.parquet", straight())
+    run(signs, drive, tmp_path / "right", 4, heading_sigma_deg=0.9, send_information=True)
+    assert declared(tmp_path / "right", "camera") == pytest.approx(
+        DECLARED | {"bearing_bias_sigma_deg": 1.5, "false_negative_rate": 0.1}
+    )
+    run(signs, drive, tmp_path / "wrong", 4, heading_sigma_deg=0.9, send_information=True, declared_sigma_scale=0.5)
+    assert declared(tmp_path / "wrong", "camera") == pytest.approx(
+        {name: value / 2 for name, value in DECLARED.items()}
+        | {"bearing_bias_sigma_deg": 0.75, "false_negative_rate": 0.1}
+    )
+    right, wrong = (read_table(DETECTIONS, tmp_path / name / "detections") for name in ("right", "wrong"))
+    np.testing.assert_array_equal(right["sigma_e_m"], wrong["sigma_e_m"])  # the draws are the same
+    s0 = [np.asarray(table["info_s0"]).sum() for table in (right, wrong)]
+    assert s0[1] / s0[0] == pytest.approx(4, rel=0.02)  # each residual weighs four times as much
+    assert s0[0] / np.asarray(right["info_dof"]).sum() == pytest.approx(1, abs=0.1)
+
+
+def test_a_kind_may_declare_the_sigmas_of_the_fleet_although_it_is_worse(signs, tmp_path):
+    drive = write_drives(tmp_path / "drive.parquet", straight())
+    scenario = tmp_path / "mine.toml"
+    worse = "share = 0.5\nrange_noise_sigma_m = 0.9\nbearing_noise_sigma_deg = 0.6\nfalse_negative_rate = 0.4\n"
+    scenario.write_text(f'[tracking]\nsend_information = true\n[mixed.liar]\n{worse}declares = "fleet"\n')
+    simulate(signs, drive, tmp_path / "out", config=load_config(scenario), n_vehicles=60)
+    assert (
+        declared(tmp_path / "out", "liar")
+        == declared(tmp_path / "out", "camera")
+        == DECLARED | {"false_negative_rate": 0.1}
+    )
+    passes, sent = (
+        read_table(PASSES, tmp_path / "out" / "passes.parquet"),
+        read_table(DETECTIONS, tmp_path / "out" / "detections"),
+    )
+    kind = dict(zip(passes["pass_id"].to_pylist(), passes["sensor_kind"].to_pylist(), strict=True))
+    is_liar = np.array([kind[name] == "liar" for name in sent["pass_id"].to_pylist()])
+    s0, dof = np.asarray(sent["info_s0"]), np.asarray(sent["info_dof"])
+    assert s0[~is_liar].sum() / dof[~is_liar].sum() == pytest.approx(1, abs=0.1)
+    assert s0[is_liar].sum() / dof[is_liar].sum() > 3  # nine, less what the gate of the tracker cuts off
+
+
+def test_an_rtk_car_in_the_fleet_knows_where_it_is(signs, tmp_path):
+    drive = write_drives(tmp_path / "drive.parquet", straight())
+    scenario = tmp_path / "mine.toml"
+    scenario.write_text("[mixed.rtk]\nshare = 0.3\ngnss_sigma_m = 0.05\n")
+    simulate(*(signs, drive, tmp_path / "out"), config=load_config(scenario, {"lateral_sigma_m": 0.0}), n_vehicles=120)
+    passes = read_table(PASSES, tmp_path / "out" / "passes.parquet")
+    is_rtk = np.array(passes["sensor_kind"].to_pylist()) == "rtk"
+    north_m = FRAME.to_enu(
+        *np.array([shapely.get_coordinates(shapely.from_wkb(g))[0] for g in passes["geometry"].to_pylist()]).T
+    )[:, 1]
+    for sigma_m, of_kind in ((0.05, is_rtk), (1.7, ~is_rtk)):
+        assert stats.kstest(north_m[of_kind], "norm", (0, sigma_m)).pvalue > 0.001
