@@ -76,7 +76,7 @@ def convert(
     InputError
         The source is missing, damaged or in no known format, or the format to write cannot hold a text of it.
     """
-    write = _writer(out)
+    write = layer_writer(out)
     if table not in TABLES:
         raise ConfigError(f"there is no table {table!r} to convert.", todo=f"Tables are {', '.join(TABLES)}.")
     schema = TABLES[table]
@@ -86,8 +86,14 @@ def convert(
     return ConvertResult(out, table, rows.num_rows, layer.file_format, dict(layer.found), dict(layer.skipped))
 
 
-def _writer(out: Path) -> Writer:
-    """Return what writes files of a suffix."""
+def layer_writer(out: Path) -> Writer:
+    """Return what writes layers to files of a suffix.
+
+    Raises
+    ------
+    ConfigError
+        The suffix is unknown.
+    """
     from geofleet.formats import osm_write, vector_write  # noqa: PLC0415  (a bad option is told without them)
 
     writers: dict[str, Writer] = {
