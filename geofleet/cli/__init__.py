@@ -10,7 +10,7 @@ import sys
 
 import typer
 
-from geofleet.cli import ingest, pipeline, tables
+from geofleet.cli import ingest, pipeline, study, tables
 from geofleet.errors import GeofleetError, InputError
 
 app = typer.Typer(
@@ -23,6 +23,7 @@ app = typer.Typer(
 app.add_typer(ingest.app, name="ingest")
 app.add_typer(pipeline.app)
 app.add_typer(tables.app)
+app.add_typer(study.app)
 
 
 def main() -> None:

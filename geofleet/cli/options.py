@@ -76,6 +76,15 @@ def parse_utm(text: str | None) -> tuple[str, float, float] | None:
     return crs, east, north
 
 
+def parse_shift(text: str) -> tuple[float, float]:
+    """Read `E,N`, metres."""
+    try:
+        east, north = map(float, text.split(","))
+    except ValueError:
+        raise ConfigError(f"{text!r} is not E,N.", where="--shift-m", todo="Example: --shift-m 1.0,0.5") from None
+    return east, north
+
+
 def parse_columns(text: str | None) -> dict[str, str] | Path | None:
     """Read `name=column,name=column`, or the path of a TOML file."""
     if text is None:

@@ -64,7 +64,7 @@ class StaleResult:
     fates: dict[str, int]
 
 
-def stale(layer: Path, out: Path, how: Staleness, *, seed: int = 0, **options: Any) -> StaleResult:
+def stale(source: Path, out: Path, how: Staleness, *, seed: int = 0, **options: Any) -> StaleResult:
     """Write an outdated copy of a layer, and what is outdated in it to `<stem>_changes.csv` beside it.
 
     Main signs meet their fates; plates go with their main sign, and everything else only shares the position error. The
@@ -73,7 +73,7 @@ def stale(layer: Path, out: Path, how: Staleness, *, seed: int = 0, **options: A
 
     Parameters
     ----------
-    layer
+    source
         Any file that `geofleet.formats.layers.read_layer` reads, a `reference` table too.
     out
         File to write, of any suffix that `geofleet convert` writes.
@@ -94,10 +94,10 @@ def stale(layer: Path, out: Path, how: Staleness, *, seed: int = 0, **options: A
     write = layer_writer(out)
     if not 0 <= seed < 2**63:
         raise ConfigError(f"the seed is {seed}.", todo="Set it between 0 and 2^63 - 1.")
-    rows = _one_map(read_layer(layer, **options).table, layer)
+    rows = _one_map(read_layer(source, **options).table, source)
     main = np.flatnonzero(pc.equal(rows["kind"], "main").to_numpy())
     if not len(main):
-        raise InputError("there is no main sign to make an outdated copy of.", where=str(layer))
+        raise InputError("there is no main sign to make an outdated copy of.", where=str(source))
     (lon, lat), ids = lonlat(rows), rows["sign_id"].to_pylist()
     keys = sign_keys(ids)
     codes = rows["sign_class"].combine_chunks().dictionary_encode().indices.to_numpy()
