@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 Rate = Annotated[float, Field(ge=0, le=1)]
 ROOT_SCENARIO = "paper"
 MIXED = "mixed"
@@ -73,7 +74,7 @@ class FleetConfig(_Section):
     headway_s: NonNegative
     drives: Annotated[Literal["one", "all"], Off("one")]
     direction: Annotated[Literal["forward", "backward", "both"], Off("forward")]
-    opposite_lane_m: Annotated[float, Field(allow_inf_nan=False), Off(3.5)]
+    opposite_lane_m: Annotated[Finite, Off(3.5)]
     frame_rate_hz: Annotated[NonNegative, Off(0.0)]
     speed_profile: Annotated[Literal["constant", "recorded"], Off("constant")]
 
@@ -105,6 +106,13 @@ class SensorConfig(_Section):
     occlusion_frames: Annotated[float, Field(ge=1, allow_inf_nan=False), Off(5.0)]
     confusion: Annotated[Literal["uniform", "group"], Off("uniform")]
     confusion_in_group: Annotated[Rate, Off(0.8)]
+    range_bias_m: Annotated[Finite, Off(0.0)]
+    bearing_bias_deg: Annotated[Finite, Off(0.0)]
+    range_bias_drift_sigma_m: Annotated[NonNegative, Off(0.0)]
+    bearing_bias_drift_sigma_deg: Annotated[NonNegative, Off(0.0)]
+    bias_drift_correlation_s: Annotated[Positive, Off(60.0)]
+    ghost_tracks_per_km: Annotated[NonNegative, Off(0.0)]
+    ghost_track_frames: Annotated[float, Field(ge=1, allow_inf_nan=False), Off(8.0)]
     declares: Annotated[Literal["own", "fleet"], Off("own")]
     declared_sigma_scale: Annotated[Positive, Off(1.0)]
 
@@ -121,7 +129,13 @@ class TrackingConfig(_Section):
     track_gate_chi2: Annotated[Positive, Off(13.8)]
     merge_gate_chi2: Annotated[Positive, Off(13.8)]
     class_error_rate: Annotated[float, Field(gt=0, lt=1), Off(0.05)]
-    send_information: Annotated[bool, Off(value=False)]
+    send_information: Annotated[bool | Literal["auto"], Off("auto")]
+    split_track_rate: Annotated[Rate, Off(0.0)]
+
+    @property
+    def sends_information(self) -> bool:
+        """Whether a vehicle sends the information form beside the mean; left to itself, the Kalman tracker does."""
+        return self.tracker == "kalman" if self.send_information == "auto" else self.send_information
 
 
 class AggregateConfig(_Section):

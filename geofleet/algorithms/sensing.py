@@ -7,8 +7,8 @@ counter-clockwise (a bearing is positive to the left), angles of the model in de
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from geofleet.algorithms.billboards import Billboards
+    from geofleet.algorithms.sensor_model import SensorModel
     from geofleet.algorithms.streams import PassStreams
     from geofleet.algorithms.trajectory import Poses
 
@@ -32,82 +33,7 @@ if TYPE_CHECKING:
 GHOST = -1
 """Stands for the sign of a detection that came from none."""
 FIRST_BILLBOARD = -2
-"""Stands for the first billboard; the next ones count downwards."""
-
-
-@dataclass(frozen=True, slots=True)
-class SensorModel:
-    """What a sensor sees and how wrong it is; every sigma is that of a zero-mean normal distribution.
-
-    Parameters
-    ----------
-    range_m, fov_deg
-        The view cone: distance below `range_m` and |bearing| below half of the full angle `fov_deg`.
-    gnss_sigma_m
-        Offset of the reported position, a axis and pass.
-    heading_sigma_deg
-        Offset of the reported heading, a pass.
-    range_bias_sigma_m, bearing_bias_sigma_deg
-        Sensor-setting error, once a sensor.
-    range_noise_sigma_m, bearing_noise_sigma_deg
-        Measurement noise, once a frame and object.
-    false_negative_rate
-        Probability that a sign in view is missed, a frame.
-    semantic_rate
-        Probability that a class is recognised.
-    semantic_draw
-        Recognition is drawn once a sign and pass (`track`), or anew for every frame (`frame`).
-    ghost_rate_per_ha
-        Expected false positives a frame and hectare of the view cone.
-    gnss_drift_sigma_m, gnss_drift_correlation_s
-        Drift of the reported position beside the offset, an axis (`pose_errors.gauss_markov`).
-    wrong_fixes_per_km, wrong_fix_length_m, wrong_fix_sigma_m
-        Episodes of a wrong fix (`pose_errors.wrong_fixes`).
-    fade_range_m, fade_width_m
-        Distance at which detection has fallen to half, and scale of the fall; 0 = it does not fall.
-    occluded_share, occlusion_frames
-        Share of frames in which a sign in view is hidden, and for how many in a row on average (`occlusion.occluded`).
-    confusion
-        P(read class | true class), shape (n, n), instead of `semantic_rate` and any other class alike.
-    """
-
-    range_m: float
-    fov_deg: float
-    gnss_sigma_m: float = 0.0
-    heading_sigma_deg: float = 0.0
-    range_bias_sigma_m: float = 0.0
-    bearing_bias_sigma_deg: float = 0.0
-    range_noise_sigma_m: float = 0.0
-    bearing_noise_sigma_deg: float = 0.0
-    false_negative_rate: float = 0.0
-    semantic_rate: float = 1.0
-    semantic_draw: Literal["track", "frame"] = "track"
-    ghost_rate_per_ha: float = 0.0
-    gnss_drift_sigma_m: float = 0.0
-    gnss_drift_correlation_s: float = 60.0
-    wrong_fixes_per_km: float = 0.0
-    wrong_fix_length_m: float = 50.0
-    wrong_fix_sigma_m: float = 10.0
-    fade_range_m: float = 0.0
-    fade_width_m: float = 10.0
-    occluded_share: float = 0.0
-    occlusion_frames: float = 5.0
-    confusion: Floats | None = None
-
-    @property
-    def half_fov_rad(self) -> float:
-        """Half of the opening angle of the view cone."""
-        return float(np.deg2rad(self.fov_deg)) / 2
-
-    @property
-    def cone_area_m2(self) -> float:
-        """Area of the view cone, ½ r² FOV (paper, "False Positives and False Negatives")."""
-        return self.range_m**2 * self.half_fov_rad
-
-    @property
-    def ghosts_per_frame(self) -> float:
-        """λ = FP_rate · A (paper, ibid.), with the rate a hectare."""
-        return self.ghost_rate_per_ha * self.cone_area_m2 / 1e4
+"""Stands for the first billboard; the next ones count downwards, and ghosts that last after them."""
 
 
 class SignField:
@@ -168,10 +94,20 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Sensor-setting error of one sensor: what it adds to every range and bearing."""
+    """Sensor-setting error of one sensor: what it adds to every range and bearing.
+
+    `drift` is what it adds beside in each frame, range in metres and bearing in radians, shape (n_frames, 2).
+    """
 
     range_bias_m: float
     bearing_bias_rad: float
+    drift: Floats | None = None
+
+    def at(self, frame: Ints) -> tuple[Floats | float, Floats | float]:
+        """Return the range bias (m) and the bearing bias (rad) in some frames."""
+        if self.drift is None:
+            return self.range_bias_m, self.bearing_bias_rad
+        return self.range_bias_m + self.drift[frame, 0], self.bearing_bias_rad + self.drift[frame, 1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,12 +173,24 @@ def _from_front(seen: Sightings, poses: Poses, facing_rad: Floats) -> Flags:
 
 
 def draw_calibration(model: SensorModel, rng: Generator) -> Calibration:
-    """Draw the sensor-setting error, ε_sensor ~ N(0, sigma_sensor²) in range and in bearing (paper, eq. 2)."""
+    """Draw the sensor-setting error, ε_sensor ~ N(0, sigma_sensor²) in range and in bearing (paper, eq. 2).
+
+    A fault that the model gives comes on top.
+    """
     range_unit, bearing_unit = rng.standard_normal(2)
     return Calibration(
-        float(model.range_bias_sigma_m * range_unit),
-        float(np.deg2rad(model.bearing_bias_sigma_deg) * bearing_unit),
+        float(model.range_bias_m + model.range_bias_sigma_m * range_unit),
+        float(np.deg2rad(model.bearing_bias_deg) + np.deg2rad(model.bearing_bias_sigma_deg) * bearing_unit),
     )
+
+
+def drifting(calibration: Calibration, poses: Poses, model: SensorModel, rng: Generator) -> Calibration:
+    """Let a sensor-setting error drift along a pass: a Gauss-Markov process each in range and in bearing."""
+    if poses.elapsed_s is None:
+        raise ValueError("a drift needs poses with times")
+    unit = gauss_markov(poses.elapsed_s, sigma_m=1.0, correlation_s=model.bias_drift_correlation_s, rng=rng)
+    sigma = np.array([model.range_bias_drift_sigma_m, np.deg2rad(model.bearing_bias_drift_sigma_deg)])
+    return replace(calibration, drift=sigma * unit)
 
 
 def reported_poses(true: Poses, model: SensorModel, rng: Generator, drift: Generator | None = None) -> Poses:
@@ -290,9 +238,10 @@ def measured(true: Sightings, calibration: Calibration, model: SensorModel, rng:
     A range may come out negative when sigma is as large as the distance; the paper does not cut it, nor do we.
     """
     n = len(true.frame)
-    range_m = true.range_m + calibration.range_bias_m + model.range_noise_sigma_m * rng.standard_normal(n)
+    range_bias_m, bearing_bias_rad = calibration.at(true.frame)
+    range_m = true.range_m + range_bias_m + model.range_noise_sigma_m * rng.standard_normal(n)
     noise_rad = np.deg2rad(model.bearing_noise_sigma_deg) * rng.standard_normal(n)
-    bearing_rad = true.bearing_rad + calibration.bearing_bias_rad + noise_rad
+    bearing_rad = true.bearing_rad + bearing_bias_rad + noise_rad
     return Sightings(true.frame, true.sign, range_m, bearing_rad)
 
 
@@ -325,6 +274,30 @@ def ghosts(n_frames: int, *, n_classes: int, model: SensorModel, rng: Generator)
     return Sightings(frame, np.full(n, GHOST), range_m, bearing_rad), class_code
 
 
+def ghost_tracks(
+    true: Poses, n_classes: int, calibration: Calibration, model: SensorModel, rng: Generator, *, first: int
+) -> tuple[Sightings, Ints]:
+    """Draw false positives that last: a reflection that looks like a sign over several frames of one pass.
+
+    Poisson along the way; each appears in a uniform frame at a uniform place of its view cone, with one random valid
+    class, lasts a geometric number of frames of mean `ghost_track_frames`, and is measured and missed as a sign is.
+    They are numbered downwards from `first`.
+    """
+    n = rng.poisson(model.ghost_tracks_per_km * (true.along_m[-1] - true.along_m[0]) / 1000.0)
+    born = rng.integers(0, len(true.along_m), n)
+    range_m = model.range_m * np.sqrt(rng.random(n))
+    azimuth_rad = true.heading_rad[born] + model.half_fov_rad * (2 * rng.random(n) - 1)
+    last = born + rng.geometric(1.0 / model.ghost_track_frames, n) - 1
+    class_code = rng.integers(0, n_classes, n)
+    if not n:
+        return Sightings(born, born, np.empty(0), np.empty(0)), class_code
+    place = true.xy_m[born] + range_m[:, None] * np.column_stack((np.cos(azimuth_rad), np.sin(azimuth_rad)))
+    visible = in_view_of(true, SignField(place, class_code, n_classes=n_classes, cell_m=model.range_m), model)
+    there = (visible.frame >= born[visible.sign]) & (visible.frame <= last[visible.sign])
+    seen = _detected(visible.take(there), calibration, model, rng, None)
+    return Sightings(seen.frame, first - seen.sign, seen.range_m, seen.bearing_rad), class_code[seen.sign]
+
+
 def projected(seen: Sightings, reported: Poses) -> tuple[Floats, Floats]:
     """Return reported positions p = pose + R(heading) d (cos θ, sin θ) (paper, eq. 6), and directions of view."""
     azimuth_rad = reported.heading_rad[seen.frame] + seen.bearing_rad
@@ -341,13 +314,18 @@ def sense_pass(
     """
     n_frames = len(true.heading_rad)
     visible = in_view_of(true, signs, model)
-    is_steady = model.gnss_drift_sigma_m == model.wrong_fixes_per_km == 0
-    reported = reported_poses(true, model, streams.pose, None if is_steady else streams.drift)
+    reported = reported_poses(true, model, streams.pose, None if model.is_steady else streams.drift)
     calibration = draw_calibration(model, streams.calibration)
+    if model.has_bias_drift:
+        calibration = drifting(calibration, true, model, streams.bias_drift)
     seen = _detected(visible, calibration, model, streams.frames, streams.occlusion if model.occluded_share else None)
     class_code = _classes_seen(seen, signs, model, streams.classes)
     if billboards is not None and len(billboards.share):
         seen, class_code = _merged(seen, class_code, *_billboards_seen(true, billboards, calibration, model, streams))
+    if model.ghost_tracks_per_km > 0:
+        first = FIRST_BILLBOARD - (0 if billboards is None else len(billboards.share))
+        phantoms = ghost_tracks(true, signs.n_classes, calibration, model, streams.ghost_tracks, first=first)
+        seen, class_code = _merged(seen, class_code, *phantoms)
     ghost, ghost_class = ghosts(n_frames, n_classes=signs.n_classes, model=model, rng=streams.ghosts)
     if len(ghost_class):
         seen, class_code = _merged(seen, class_code, ghost, ghost_class)

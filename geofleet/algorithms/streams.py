@@ -13,6 +13,7 @@ import numpy as np
 from numpy.random import Generator, SeedSequence
 
 _CALIBRATION, _POSE, _FRAMES, _CLASSES, _GHOSTS, _CHOICE, _DRIFT, _OCCLUSION, _BILLBOARDS = range(9)
+_BIAS_DRIFT, _GHOST_TRACKS, _SPLITS = range(9, 12)
 
 
 class PassStreams:
@@ -38,6 +39,12 @@ class PassStreams:
         What hides signs for several frames.
     billboards
         Which billboards are taken for signs.
+    bias_drift
+        What the sensor-setting error does along the way.
+    ghost_tracks
+        False positives that last.
+    splits
+        Which tracks are sent in two.
     """
 
     def __init__(self, seed: int, replicate: int, vehicle: int, pass_number: int) -> None:
@@ -79,6 +86,18 @@ class PassStreams:
     @cached_property
     def billboards(self) -> Generator:  # noqa: D102
         return self._of_pass(_BILLBOARDS)
+
+    @cached_property
+    def bias_drift(self) -> Generator:  # noqa: D102
+        return self._of_pass(_BIAS_DRIFT)
+
+    @cached_property
+    def ghost_tracks(self) -> Generator:  # noqa: D102
+        return self._of_pass(_GHOST_TRACKS)
+
+    @cached_property
+    def splits(self) -> Generator:  # noqa: D102
+        return self._of_pass(_SPLITS)
 
 
 def pass_streams(seed: int, *, replicate: int, vehicle: int, pass_number: int = 0) -> PassStreams:

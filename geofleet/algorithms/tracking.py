@@ -18,9 +18,11 @@ from geofleet.algorithms.sensing import GHOST
 from geofleet.algorithms.tracking_kernels import associate, majority, moments
 
 if TYPE_CHECKING:
+    from numpy.random import Generator
     from numpy.typing import NDArray
 
     from geofleet.algorithms.sensing import FrameDetections
+    from geofleet.algorithms.streams import PassStreams
     from geofleet.algorithms.trajectory import Poses
 
     Floats = NDArray[np.float64]
@@ -53,7 +55,9 @@ class TrackerModel:
     class_error_rate
         `kalman`: how often a frame reads another class than the sign's.
     send_information
-        Send the information form beside the mean; `kalman` always does.
+        Send the information form beside the mean.
+    split_track_rate
+        Share of the tracks long enough for two that are sent as two (`split_tracks`).
     noise
         What the vehicle knows about its sensor: for `kalman` and for the information form.
     """
@@ -70,6 +74,7 @@ class TrackerModel:
     merge_gate_chi2: float = 13.8
     class_error_rate: float = 0.05
     send_information: bool = False
+    split_track_rate: float = 0.0
     noise: PolarNoise = field(default_factory=lambda: PolarNoise(0.3, 0.0035, 2.4, 0.021))
 
 
@@ -110,16 +115,27 @@ class Tracks:
     information: Information | None = None
 
 
-def track_pass(seen: FrameDetections, reported: Poses, model: TrackerModel) -> Tracks:
-    """Track the detections of a pass and return what is sent: tracks of at least `min_track_frames` frames."""
+def track_pass(
+    seen: FrameDetections, reported: Poses, model: TrackerModel, streams: PassStreams | None = None
+) -> Tracks:
+    """Track the detections of a pass and return what is sent: tracks of at least `min_track_frames` frames.
+
+    `streams` are needed to split tracks, which is the one thing here that is random.
+    """
     if model.tracker == "ideal":
         track = track_ideal(seen)
     elif model.tracker == "kalman":
         track = track_kalman(seen, reported, model)
     else:
         track = track_paper(seen, reported, model)
+    if model.split_track_rate > 0:
+        if streams is None:
+            raise ValueError("to split tracks takes random numbers: give the streams of the pass")
+        track = split_tracks(
+            track, rate=model.split_track_rate, min_track_frames=model.min_track_frames, rng=streams.splits
+        )
     tracks = summarise(seen, track, min_track_frames=model.min_track_frames)
-    if model.tracker != "kalman" and not model.send_information:
+    if not model.send_information:
         return tracks
     return replace(tracks, information=_information(seen, reported, track, model))
 
@@ -156,7 +172,27 @@ def track_paper(seen: FrameDetections, reported: Poses, model: TrackerModel) -> 
 def track_ideal(seen: FrameDetections) -> Ints:
     """Return the track of every detection with identities known: one a sign, one a ghost, numbered by birth."""
     fresh = seen.sign.max(initial=0) + 1 + np.arange(len(seen.sign))
-    identity = np.where(seen.sign == GHOST, fresh, seen.sign)
+    return _by_birth(np.where(seen.sign == GHOST, fresh, seen.sign))
+
+
+def split_tracks(track: Ints, *, rate: float, min_track_frames: int, rng: Generator) -> Ints:
+    """Cut a share of the tracks in two and return the track of every detection, numbered by birth.
+
+    A track of 2 `min_track_frames` detections or more is cut with probability `rate`, at any detection that leaves both
+    parts long enough to be sent, alike.
+    """
+    count = np.bincount(track)
+    chance, where = rng.random((2, len(count)))
+    is_cut = (chance < rate) & (count >= 2 * min_track_frames)
+    cut = np.where(is_cut, min_track_frames + (where * (count - 2 * min_track_frames + 1)).astype(np.int64), count)
+    order = np.argsort(track, kind="stable")
+    rank = np.empty(len(track), dtype=np.int64)
+    rank[order] = np.arange(len(track)) - np.repeat(np.cumsum(count) - count, count)
+    return _by_birth(2 * track + (rank >= cut[track]))
+
+
+def _by_birth(identity: Ints) -> Ints:
+    """Return the number of each identity, counted by first occurrence."""
     _, first, inverse = np.unique(identity, return_index=True, return_inverse=True)
     birth_order = np.empty(len(first), dtype=np.int64)
     birth_order[np.argsort(first)] = np.arange(len(first))

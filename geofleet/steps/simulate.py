@@ -216,7 +216,7 @@ def _simulate_pass(fleet: Fleet, run: _Run, vehicle: int) -> _PassOutput:
     streams = pass_streams(run.seed, replicate=run.replicate, vehicle=vehicle)
     drive = fleet.start(vehicle, streams)
     sensed = sense_pass(drive.true, fleet.scene.field, drive.kind.sensor, streams, run.billboards)
-    tracks = track_pass(sensed.detections, sensed.reported, drive.kind.tracker)
+    tracks = track_pass(sensed.detections, sensed.reported, drive.kind.tracker, streams)
     ids = PassIds.of(run.run_id, vehicle)
     table = detections_table(ids, tracks, fleet.scene.classes, fleet.frame, drive.times)
     if run.n_vehicles <= FOLDER_A_VEHICLE:

@@ -9,7 +9,7 @@ import numpy as np
 
 from geofleet.algorithms.billboards import Billboards, place_billboards
 from geofleet.algorithms.confusion import confusion_matrix
-from geofleet.algorithms.sensing import SensorModel
+from geofleet.algorithms.sensor_model import SensorModel
 from geofleet.algorithms.streams import world_stream
 from geofleet.algorithms.tracking import TrackerModel
 from geofleet.algorithms.trajectory import Poses, beside, frames_in_time, resample, travel_times, wander
@@ -200,7 +200,7 @@ def _kind(upto_share: float, config: SensorConfig, scene: Scene, study: Config) 
     sensor = SensorModel(**values, confusion=confusion)
     declared = Declared.by(config, study.sensor)
     tracker = TrackerModel(
-        **study.tracking.model_dump(),
+        **study.tracking.model_dump() | {"send_information": study.tracking.sends_information},
         range_m=sensor.range_m,
         half_fov_rad=sensor.half_fov_rad,
         noise=declared.noise,

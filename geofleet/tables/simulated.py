@@ -147,7 +147,6 @@ def reference_table(scene: Scene, run_id: str, n_passes: Ints, n_frames: Ints) -
 
 def runs_table(config: Config, run_ids: tuple[str, ...], *, seed: int, n_vehicles: int, digest: str) -> pa.Table:
     """Return a row a replicate, in their order."""
-    is_information = config.tracking.tracker == "kalman" or config.tracking.send_information
     return build_table(
         RUNS,
         {
@@ -157,7 +156,7 @@ def runs_table(config: Config, run_ids: tuple[str, ...], *, seed: int, n_vehicle
             "replicate": np.arange(len(run_ids)),
             "n_vehicles": n_vehicles,
             "tracker": config.tracking.tracker,
-            "upload": "information" if is_information else "mean",
+            "upload": "information" if config.tracking.sends_information else "mean",
             "config_digest": digest,
         },
     )

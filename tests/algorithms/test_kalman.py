@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from collections import Counter
 from typing import TYPE_CHECKING
 
@@ -14,7 +16,8 @@ from scipy.spatial import cKDTree
 from geofleet.algorithms.fragments import join_fragments
 from geofleet.algorithms.information import PolarNoise, TrackRows, information_form, pass_bias
 from geofleet.algorithms.kalman import track_kalman
-from geofleet.algorithms.sensing import GHOST, FrameDetections, SensorModel, SignField, sense_pass
+from geofleet.algorithms.sensing import GHOST, FrameDetections, SignField, sense_pass
+from geofleet.algorithms.sensor_model import SensorModel
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import TrackerModel, track_ideal, track_paper, track_pass
 from geofleet.algorithms.trajectory import Poses
@@ -170,6 +173,6 @@ def test_a_bias_known_to_be_none_stays_none_and_exact_detections_give_exact_plac
 def test_a_pass_without_detections_has_no_tracks():
     none = np.empty(0, dtype=np.int64)
     seen = FrameDetections(none, none, none, np.empty((0, 2)), np.empty(0), np.empty(0), 5)
-    tracks = track_pass(seen, street_pass(0)[1], TRACKER)
+    tracks = track_pass(seen, street_pass(0)[1], replace(TRACKER, send_information=True))
     assert tracks.information is not None
     assert len(tracks.n_frames) == len(tracks.information.s0) == 0

@@ -12,7 +12,16 @@ from geofleet.algorithms.billboards import Billboards, place_billboards
 from geofleet.algorithms.confusion import confusion_matrix, read_classes
 from geofleet.algorithms.occlusion import occluded
 from geofleet.algorithms.pose_errors import gauss_markov, wrong_fixes
-from geofleet.algorithms.sensing import FIRST_BILLBOARD, SensorModel, SignField, in_view_of, miss_rate, sense_pass
+from geofleet.algorithms.sensing import (
+    FIRST_BILLBOARD,
+    Calibration,
+    SignField,
+    ghost_tracks,
+    in_view_of,
+    miss_rate,
+    sense_pass,
+)
+from geofleet.algorithms.sensor_model import SensorModel
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.trajectory import (
     Poses,
@@ -227,3 +236,105 @@ def test_frames_in_time_follow_the_recorded_speed_and_skip_standstill():
 def test_lateral_wander_keeps_the_times():
     moved = wander(straight(), sigma_m=0.4, correlation_m=50.0, spacing_m=2.0, rng=np.random.default_rng(0))
     np.testing.assert_array_equal(moved.elapsed_s, straight().elapsed_s)
+
+
+def test_a_fault_of_the_calibration_shifts_every_measurement_alike():
+    signs = SignField(np.array([[100.0, 5.0], [220.0, -4.0]]), np.array([0, 1]), n_classes=2, cell_m=50.0)
+    for vehicle in range(3):
+        streams = pass_streams(0, replicate=0, vehicle=vehicle)
+        result = sense_pass(straight(), signs, replace(EXACT, range_bias_m=5.0, bearing_bias_deg=-3.0), streams)
+        np.testing.assert_allclose(result.detections.range_m - result.in_view.range_m, 5.0)
+        turned = result.detections.azimuth_rad - result.in_view.bearing_rad  # the car drives east
+        np.testing.assert_allclose(turned, np.deg2rad(-3.0))
+
+
+def test_the_sensor_setting_error_drifts_as_a_stationary_process_beside_its_constant():
+    """Two minutes apart the drift has forgotten itself (τ = 20 s); 2 s apart it keeps exp(-0.1)."""
+    poses, drift = straight(1300), []
+    signs = SignField(
+        np.column_stack((np.arange(20.0, 2600, 8), np.full(323, 2.0))), np.zeros(323, int), n_classes=1, cell_m=50.0
+    )
+    model = replace(
+        EXACT, range_bias_drift_sigma_m=1.5, bearing_bias_drift_sigma_deg=0.8, bias_drift_correlation_s=20.0
+    )
+    for vehicle in range(200):
+        result = sense_pass(poses, signs, model, pass_streams(3, replicate=0, vehicle=vehicle))
+        off_m = result.detections.range_m - result.in_view.range_m
+        off_deg = np.rad2deg(result.detections.azimuth_rad - result.in_view.bearing_rad)
+        frame = result.detections.frame
+        _, first = np.unique(frame, return_index=True)
+        for axis in (off_m, off_deg):
+            np.testing.assert_allclose(axis, axis[first][np.searchsorted(frame[first], frame)], atol=1e-9)  # by frame
+        at = [first[frame[first] == k][0] for k in (0, 10, 600, 1200)]
+        drift.append(np.column_stack((off_m[at], off_deg[at])))
+    drift = np.array(drift)  # (pass, time, axis)
+    for axis, sigma in enumerate((1.5, 0.8)):
+        apart = drift[:, [0, 2, 3], axis]
+        assert stats.kstest(apart.ravel(), "norm", (0, sigma)).pvalue > P_MIN
+        assert stats.pearsonr(apart[:, 0], apart[:, 1]).pvalue > P_MIN
+        fresh = (drift[:, 1, axis] - np.exp(-0.1) * drift[:, 0, axis]) / (sigma * np.sqrt(1 - np.exp(-0.2)))
+        assert stats.kstest(fresh, "norm").pvalue > P_MIN
+    assert stats.pearsonr(*drift[:, 0].T).pvalue > P_MIN
+
+
+def test_a_bias_drift_leaves_all_other_draws_alone_and_needs_times():
+    signs = SignField(np.array([[100.0, 5.0]]), np.array([0]), n_classes=1, cell_m=50.0)
+    noisy = replace(EXACT, gnss_sigma_m=1.0, range_bias_sigma_m=1.0, range_noise_sigma_m=0.5, false_negative_rate=0.2)
+    plain, other = (
+        sense_pass(straight(), signs, model, pass_streams(0, replicate=0, vehicle=0))
+        for model in (noisy, replace(noisy, range_bias_drift_sigma_m=2.0))
+    )
+    np.testing.assert_array_equal(plain.detections.frame, other.detections.frame)
+    np.testing.assert_array_equal(plain.reported.xy_m, other.reported.xy_m)
+    np.testing.assert_array_equal(plain.detections.azimuth_rad, other.detections.azimuth_rad)
+    assert np.std(other.detections.range_m - plain.detections.range_m) > 0
+    with pytest.raises(ValueError, match="times"):
+        sense_pass(
+            replace(straight(), elapsed_s=None),
+            *(signs, replace(EXACT, range_bias_drift_sigma_m=2.0), pass_streams(0, replicate=0, vehicle=0)),
+        )
+
+
+def test_ghosts_that_last_come_at_their_rate_stay_at_their_place_and_last_as_long_as_they_say():
+    rng, model = np.random.default_rng(9), replace(EXACT, ghost_tracks_per_km=6.0, ghost_track_frames=5.0)
+    exact, n_ghosts, lengths, square, classes = Calibration(0.0, 0.0), 0, [], [], []
+    for _ in range(300):
+        seen, class_code = ghost_tracks(straight(), 4, exact, model, rng, first=-7)
+        for ghost in np.unique(seen.sign):
+            rows = np.flatnonzero(seen.sign == ghost)
+            assert (np.diff(seen.frame[rows]) == 1).all()
+            assert len(set(class_code[rows].tolist())) == 1
+            place = 2.0 * seen.frame[rows] + seen.range_m[rows] * np.exp(1j * seen.bearing_rad[rows])
+            np.testing.assert_allclose(place, place[0], atol=1e-9)
+            classes.append(class_code[rows[0]])
+            square.append((seen.range_m[rows[0]] / 50.0) ** 2)
+            ahead_m = place[0].real - 2.0 * seen.frame[rows[0]] - abs(place[0].imag) * np.sqrt(3)
+            if ahead_m > 2.0 * 9 and seen.frame[rows[0]] < 290:  # in view for nine frames more
+                lengths.append(len(rows))
+        assert seen.sign.max(initial=-7) <= -7
+        n_ghosts += len(np.unique(seen.sign))
+    expected = 300 * 6.0 * 0.598
+    assert stats.poisson.cdf(n_ghosts, expected) == pytest.approx(0.5, abs=0.499)
+    assert stats.kstest(square, "uniform").pvalue > P_MIN
+    assert stats.chisquare(np.bincount(classes, minlength=4)).pvalue > P_MIN
+    counts = np.bincount(np.minimum(lengths, 10), minlength=11)[1:]
+    share = stats.geom.pmf(np.arange(1, 11), 1 / 5.0)
+    share[-1] = 1 - share[:-1].sum()
+    assert stats.chisquare(counts, share * counts.sum()).pvalue > P_MIN
+
+
+def test_ghosts_that_last_are_missed_as_signs_are_and_carry_the_bias():
+    model = replace(EXACT, ghost_tracks_per_km=40.0, ghost_track_frames=30.0, false_negative_rate=0.3)
+    kept, all_ = (
+        sum(
+            len(ghost_tracks(straight(), 2, Calibration(bias_m, 0.0), m, np.random.default_rng(k), first=-2)[0].frame)
+            for k in range(40)
+        )
+        for m, bias_m in ((model, 4.0), (replace(model, false_negative_rate=0.0), 0.0))
+    )
+    assert stats.binomtest(kept, all_, 0.7).pvalue > P_MIN
+    off, exact = (
+        ghost_tracks(straight(), 2, Calibration(bias_m, 0.0), model, np.random.default_rng(0), first=-2)[0].range_m
+        for bias_m in (4.0, 0.0)
+    )
+    np.testing.assert_allclose(off - exact, 4.0)

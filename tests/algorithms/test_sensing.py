@@ -11,7 +11,6 @@ from scipy import stats
 from geofleet.algorithms.sensing import (
     GHOST,
     Calibration,
-    SensorModel,
     Sightings,
     SignField,
     draw_calibration,
@@ -24,6 +23,7 @@ from geofleet.algorithms.sensing import (
     reported_poses,
     sense_pass,
 )
+from geofleet.algorithms.sensor_model import SensorModel
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.trajectory import Poses, drive_line, resample, wander
 from geofleet.errors import InputError

@@ -7,12 +7,14 @@ from itertools import combinations, permutations
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from geofleet.algorithms.sensing import GHOST, FrameDetections, SensorModel, SignField, sense_pass
+from geofleet.algorithms.sensing import GHOST, FrameDetections, SignField, sense_pass
+from geofleet.algorithms.sensor_model import SensorModel
 from geofleet.algorithms.streams import pass_streams
-from geofleet.algorithms.tracking import TrackerModel, summarise, track_ideal, track_paper, track_pass
+from geofleet.algorithms.tracking import TrackerModel, split_tracks, summarise, track_ideal, track_paper, track_pass
 from geofleet.algorithms.tracking_kernels import match_within
 from geofleet.algorithms.trajectory import Poses
 
@@ -239,3 +241,36 @@ def _in_cone(place: np.ndarray, poses: Poses, frame: int, model: TrackerModel) -
     bearing = np.arctan2(step[1], step[0]) - poses.heading_rad[frame]
     bearing = np.arctan2(np.sin(bearing), np.cos(bearing))
     return bool(np.hypot(*step) < model.range_m and abs(bearing) < model.half_fov_rad)
+
+
+def test_a_share_of_the_tracks_is_sent_in_two_parts_that_never_share_a_frame() -> None:
+    length = np.tile([4, 6, 9, 30], 1000)
+    track = np.random.default_rng(1).permutation(np.repeat(np.arange(len(length)), length))
+    order = np.unique(track, return_index=True)[1].argsort()
+    track = np.argsort(order)[track]  # by birth
+    length = np.bincount(track)
+    parts = split_tracks(track, rate=0.3, min_track_frames=3, rng=np.random.default_rng(2))
+    first_row = np.unique(parts, return_index=True)[1]
+    assert (np.diff(first_row) > 0).all()  # numbered by birth
+    origin, size = track[first_row], np.bincount(parts)
+    n_parts = np.bincount(origin)
+    assert (n_parts[length < 6] == 1).all()
+    assert stats.binomtest(int((n_parts[length >= 6] == 2).sum()), int((length >= 6).sum()), 0.3).pvalue > 0.001
+    assert size.min() >= 3
+    last_row = len(parts) - 1 - np.unique(parts[::-1], return_index=True)[1]
+    two = np.flatnonzero(n_parts[origin] == 2)
+    for k in range(len(length)):
+        if n_parts[k] == 2:
+            a, b = two[origin[two] == k]
+            assert last_row[a] < first_row[b]
+    longest = two[(length[origin[two]] == 30) & (first_row[two] == np.unique(track, return_index=True)[1][origin[two]])]
+    assert stats.chisquare(np.bincount(size[longest], minlength=28)[3:28]).pvalue > 0.001
+
+
+def test_to_split_tracks_takes_random_numbers() -> None:
+    seen, reported = frames_of(*[(k, 30.0, 5.0) for k in range(10)])
+    model = replace(PAPER, split_track_rate=1.0)
+    with pytest.raises(ValueError, match="streams of the pass"):
+        track_pass(seen, reported, model)
+    halves = track_pass(seen, reported, model, pass_streams(0, replicate=0, vehicle=0))
+    assert len(halves.n_frames) == 2

@@ -16,8 +16,8 @@ from geofleet.config import load_config
 from geofleet.errors import ConfigError, InputError
 from geofleet.steps.aggregate import aggregate
 from geofleet.steps.simulate import simulate
-from geofleet.tables.schemas import DETECTIONS, DRIVES, PASSES, REFERENCE, SIGNS, TRUTH
-from geofleet.tables.store import build_table, read_table, write_table
+from geofleet.tables.schemas import DETECTIONS, DRIVES, PASSES, REFERENCE, RUNS, SIGNS, TRUTH
+from geofleet.tables.store import build_table, lonlat, read_table, write_table
 
 FRAME = EnuFrame(24.9450453, 60.1677108)  # that of make_signs
 CLASSES = ["yield", "no_entry", "straight_only", "pedestrian_crossing"]
@@ -250,3 +250,63 @@ def test_an_rtk_car_in_the_fleet_knows_where_it_is(signs, tmp_path):
     )[:, 1]
     for sigma_m, of_kind in ((0.05, is_rtk), (1.7, ~is_rtk)):
         assert stats.kstest(north_m[of_kind], "norm", (0, sigma_m)).pvalue > 0.001
+
+
+def test_a_kalman_fleet_may_send_means_alone(signs, tmp_path):
+    drive = write_drives(tmp_path / "drive.parquet", straight())
+    for name, options in (("both", {}), ("mean", {"send_information": False})):
+        run(signs, drive, tmp_path / name, 3, tracker="kalman", **options)
+    both, mean = (read_table(DETECTIONS, tmp_path / name / "detections") for name in ("both", "mean"))
+    assert [name for name in both.column_names if name not in mean.column_names] == [
+        f"info_{part}" for part in ("lon", "lat", "matrix", "vector", "s0", "dof")
+    ]
+    assert both.select([name for name in mean.column_names if name != "run_id"]).equals(mean.drop_columns("run_id"))
+    for name, upload in (("both", "information"), ("mean", "mean")):
+        assert read_table(RUNS, tmp_path / name / "runs.parquet")["upload"].to_pylist() == [upload]
+
+
+def test_ghosts_that_last_get_past_every_tracker_and_single_ones_past_none(signs, tmp_path):
+    drive = write_drives(tmp_path / "drive.parquet", straight())
+    n_ghosts = {}
+    for tracker in ("ideal", "kalman", "paper"):
+        for name, options in (("single", {"ghost_rate_per_ha": 0.2}), ("lasting", {"ghost_tracks_per_km": 20.0})):
+            out = tmp_path / f"{tracker}-{name}"
+            run(signs, drive, out, 40, tracker=tracker, **options)
+            n_ghosts[tracker, name] = pc.sum(read_table(TRUTH, out / "truth")["is_ghost"]).as_py()
+    assert n_ghosts["ideal", "single"] == 0
+    # 20 a km over 0.298 km and 40 passes make 238; those of fewer than three detections are not sent
+    assert all(70 < n_ghosts[tracker, "lasting"] < 238 for tracker in ("ideal", "kalman", "paper"))
+
+
+def test_a_kind_with_a_fault_of_its_calibration_reports_signs_too_far(signs, tmp_path):
+    drive = write_drives(tmp_path / "drive.parquet", straight())
+    scenario = tmp_path / "mine.toml"
+    scenario.write_text("[mixed.broken]\nshare = 0.5\nrange_bias_m = 8.0\n")
+    exact = {"gnss_sigma_m": 0.0, "range_bias_sigma_m": 0.0, "bearing_bias_sigma_deg": 0.0, "tracker": "ideal"}
+    simulate(signs, drive, tmp_path / "out", config=load_config(scenario, exact), n_vehicles=20)
+    passes = read_table(PASSES, tmp_path / "out" / "passes.parquet")
+    assert set(passes["range_bias_sigma_m"].to_pylist()) == {0.0}  # it does not know
+    kind = dict(zip(passes["pass_id"].to_pylist(), passes["sensor_kind"].to_pylist(), strict=True))
+    sent, truth = read_table(DETECTIONS, tmp_path / "out" / "detections"), read_table(TRUTH, tmp_path / "out" / "truth")
+    keys = [("pass_id", "ascending"), ("track_id", "ascending")]
+    sent, truth = sent.sort_by(keys), truth.sort_by(keys)
+    layer = read_table(SIGNS, signs)
+    place = dict(zip(layer["sign_id"].to_pylist(), FRAME.to_enu(*lonlat(layer)), strict=True))
+    off_m = FRAME.to_enu(*lonlat(sent)) - np.array([place[name] for name in truth["ref_sign_id"].to_pylist()])
+    is_broken = np.array([kind[name] == "broken" for name in sent["pass_id"].to_pylist()])
+    assert off_m[~is_broken].mean(axis=0) == pytest.approx([0, 0], abs=0.05)
+    assert off_m[is_broken, 0].mean() == pytest.approx(8.0, abs=0.3)  # ahead of the car, which drives east
+
+
+def test_half_of_the_long_tracks_are_sent_in_two(signs, tmp_path):
+    drive = write_drives(tmp_path / "drive.parquet", straight())
+    n = {}
+    for rate in (0.0, 0.5):
+        out = tmp_path / f"{rate}"
+        run(signs, drive, out, 40, tracker="ideal", split_track_rate=rate)
+        truth = read_table(TRUTH, out / "truth")
+        n[rate] = truth.group_by(["pass_id", "ref_sign_id"]).aggregate([("track_id", "count")])["track_id_count"]
+    assert set(n[0.0].to_pylist()) == {1}
+    counts = np.bincount(n[0.5].to_pylist())
+    assert len(counts) == 3
+    assert stats.binomtest(int(counts[2]), int(counts.sum()), 0.5).pvalue > 0.001
