@@ -150,6 +150,7 @@ class AggregateConfig(_Section):
     max_k: Annotated[int, Field(ge=1)]
     min_support: Annotated[int, Field(ge=1)]
     min_support_share: Rate
+    correct_bias: Annotated[bool, Off(value=False)]
     tile_zoom: Annotated[int, Field(ge=12, le=20)]
 
 

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
 
 COMMON_SIGMA_M = 1.0
-SPREAD_SIGMA_M = 1.0
 POSITION_DIGITS = 9  # degrees: 0.1 mm
 _HASH_DIGITS = 12
 
@@ -51,25 +50,20 @@ class FusedSigns:
     n_detections: Ints
 
 
-def information_weights(n_frames: Floats, spread_m2: Floats) -> Floats:
+def information_weights(var_m2: Floats) -> Floats:
     """Return what each detection knows about the position of its sign, 1/m².
 
-    The mean of F frames with spread s is wrong by σ² = τ² + s²/F. The part τ is common to the frames of a pass (GNSS
-    offset, range and bearing calibration), so no number of frames removes it; detections do not declare it, and
-    COMMON_SIGMA_M (1 m, the order of a car's GNSS) stands for it. It keeps a long or a smooth track from outvoting
-    whole passes. Missing values widen the error and never exclude: frames NaN count as one, a spread NaN (or of a
-    single frame) as SPREAD_SIGMA_M².
+    A detection is wrong by σ² = τ² + v, v being the variance of its mean over frames (s²/F for F frames of spread s).
+    The part τ is common to the frames of a pass (GNSS offset, range and bearing calibration), so no number of frames
+    removes it; detections do not declare it, and COMMON_SIGMA_M (1 m, the order of a car's GNSS) stands for it. It
+    keeps a long or a smooth track from outvoting whole passes.
 
     Parameters
     ----------
-    n_frames
-        (n,) frames of the detection, NaN if unknown.
-    spread_m2
-        (n,) variance over frames of one axis (mean of east and north), m², NaN if unknown.
+    var_m2
+        (n,) variance of the position of each detection, mean of east and north, m².
     """
-    frames = np.fmax(n_frames, 1.0)
-    spread = np.where(np.isfinite(spread_m2) & (spread_m2 >= 0), spread_m2, SPREAD_SIGMA_M**2)
-    return 1.0 / (COMMON_SIGMA_M**2 + spread / frames)
+    return 1.0 / (COMMON_SIGMA_M**2 + var_m2)
 
 
 def fuse(lon_deg: Floats, lat_deg: Floats, *, weight: Floats, pass_code: Ints, first: Ints) -> FusedSigns:

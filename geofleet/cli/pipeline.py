@@ -69,6 +69,9 @@ def aggregate(
     k_from: Annotated[Path | None, typer.Option(help="Reference that tells K (an oracle): kmeans, kmedoids.")] = None,
     min_support: Annotated[int | None, typer.Option(help="Passes that a sign needs.")] = None,
     passes: Annotated[Path | None, typer.Option(help="A passes table: support relative to who saw the place.")] = None,
+    correct_bias: Annotated[
+        bool | None, typer.Option("--correct-bias", help="Take the bias of each pass out first (information form).")
+    ] = None,
     tile_zoom: Annotated[int | None, typer.Option(help="Size of the tiles; the result does not depend on it.")] = None,
     config: ConfigFile = None,
     scenario: Scenario = "paper",
@@ -92,6 +95,7 @@ def aggregate(
         min_cluster_size=min_cluster_size,
         k=k,
         min_support=min_support,
+        correct_bias=correct_bias,
         tile_zoom=tile_zoom,
     )
     with progress_bar("aggregating") as progress:

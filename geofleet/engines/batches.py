@@ -107,7 +107,7 @@ def fuse_members(rows: Columns, cluster: Ints, *, is_weighted: bool = True, is_m
     rows = {name: values[order] for name, values in rows.items()}
     first = np.append(np.flatnonzero(np.diff(cluster[order], prepend=-1)), cluster.size)
     lead = first[:-1]
-    weight = information_weights(rows["n_frames"], rows["spread_m2"]) if is_weighted else np.ones(cluster.size)
+    weight = information_weights(rows["var_m2"]) if is_weighted else np.ones(cluster.size)
     fused = fuse(rows["lon"], rows["lat"], weight=weight, pass_code=rows["pass_code"], first=first)
     if is_medoid is not None:
         fused = move_to_members(fused, rows["lon"][is_medoid[order]], rows["lat"][is_medoid[order]])

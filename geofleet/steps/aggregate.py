@@ -107,7 +107,7 @@ def aggregate(
         Use the first so many vehicles of every run, in the order of their ids; all by default.
     passes
         A `passes` table of the same runs. Support is then relative to the passes that had a place in view, instead of
-        to the vehicles, and the layer carries `n_opportunities`.
+        to the vehicles, and the layer carries `n_opportunities`. What it declares about biases is used to correct them.
     k_from
         A `reference` table or any `signs` layer: K-Means and K-Medoids are given its number of signs (of each class,
         semantic first), which no real job knows. The layer's method says `oracle-k`.
@@ -131,7 +131,7 @@ def aggregate(
     counts = reference_counts(k_from, semantic=settings.semantic) if k_from else None
     out.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}.") as folder:
-        staged = _stage(detections, Path(folder), settings, n_vehicles=n_vehicles or 0, n_workers=n_workers)
+        staged = _stage(detections, Path(folder), settings, n_vehicles=n_vehicles, passes=passes, n_workers=n_workers)
         method = settings.method
         if method == "dbscan":
             results = list(
@@ -172,8 +172,8 @@ def aggregate(
 
 
 def _label(settings: AggregateConfig, k_from: Path | None) -> str:
-    """Return how the layer calls its method; where K came from is part of it."""
-    label = f"{settings.method}-{settings.semantic}"
+    """Return how the layer calls its method; where K came from and whether biases are taken out are part of it."""
+    label = f"{settings.method}-{settings.semantic}{'-corrected' * settings.correct_bias}"
     if settings.method not in {"kmeans", "kmedoids"}:
         if k_from or settings.k:
             raise ConfigError(
@@ -191,7 +191,15 @@ def _label(settings: AggregateConfig, k_from: Path | None) -> str:
     return f"{label}-oracle-k" if k_from else f"{label}-k{settings.k}" if settings.k else label
 
 
-def _stage(detections: Path, folder: Path, settings: AggregateConfig, *, n_vehicles: int, n_workers: int) -> Staged:
+def _stage(
+    detections: Path,
+    folder: Path,
+    settings: AggregateConfig,
+    *,
+    n_vehicles: int | None,
+    passes: Path | None,
+    n_workers: int,
+) -> Staged:
     connection = connect(threads=n_workers, memory_limit=DUCKDB_MEMORY)
     try:
         return stage_detections(
@@ -201,7 +209,9 @@ def _stage(detections: Path, folder: Path, settings: AggregateConfig, *, n_vehic
             zoom=settings.tile_zoom,
             halo_m=halo_m(settings.eps_m) if settings.method == "dbscan" else 0.0,
             batch_rows=BATCH_ROWS,
-            n_vehicles=n_vehicles,
+            n_vehicles=n_vehicles or 0,
+            passes=passes,
+            correct_bias=settings.correct_bias,
         )
     finally:
         connection.close()
@@ -300,11 +310,12 @@ def _notes(staged: Staged, n_vehicles: int | None) -> tuple[str, ...]:
     """Return what the user should know beside the counts."""
     if not staged.fleet:
         return ("There are no detections: the layer is empty.",)
-    return tuple(
+    few = tuple(
         f"Run {run_id}: {reporting} of the {n_vehicles} vehicles asked for have detections."
         for run_id, reporting in staged.fleet.items()
         if n_vehicles and reporting < n_vehicles
     )
+    return few + (staged.bias.notes() if staged.bias else ())
 
 
 def _write_manifest(result: AggregateResult, inputs: list[Path], config: Config) -> None:

@@ -16,10 +16,13 @@ if TYPE_CHECKING:
 _NUMBERS = ("INT", "DOUBLE", "FLOAT", "DECIMAL", "HUGEINT")
 
 
-def bind_table(connection: duckdb.DuckDBPyConnection, schema: Schema, path: Path, *, name: str = "") -> None:
+def bind_table(
+    connection: duckdb.DuckDBPyConnection, schema: Schema, path: Path, *, name: str = "", is_filled: bool = False
+) -> None:
     """Make a view of a Parquet file, or of a hive-partitioned folder of them, named `name` or after the schema.
 
-    Partition values stay text: DuckDB's own hive reader would take vehicle `007` for the number 7.
+    Partition values stay text: DuckDB's own hive reader would take vehicle `007` for the number 7. With `is_filled`,
+    optional columns that the file lacks are there, and null.
 
     Raises
     ------
@@ -44,6 +47,10 @@ def bind_table(connection: duckdb.DuckDBPyConnection, schema: Schema, path: Path
         ) from None
     absent = [key for key in schema.partitions if key not in view.columns] if path.is_dir() else []
     values = [f"url_decode(regexp_extract(filename, '/{key}=([^/]*)/', 1)) AS {key}" for key in absent]
+    if is_filled:
+        wanted = connection.from_arrow(schema.arrow().empty_table())
+        kinds = dict(zip(wanted.columns, wanted.types, strict=True))
+        values += [f"NULL::{kinds[c.name]} AS {c.name}" for c in schema.optional if c.name not in view.columns]
     view = view.project(", ".join(["* EXCLUDE (filename)", *values]))
     _check(connection, schema, view, path)
     view.create_view(name or schema.name, replace=True)
@@ -53,7 +60,8 @@ def _check(connection: duckdb.DuckDBPyConnection, schema: Schema, view: duckdb.D
     where = f"{path}: table {schema.name}"
     todo = f"`geofleet schema {schema.name}` prints what it must hold."
     found = {name: str(kind) for name, kind in zip(view.columns, view.types, strict=True)}
-    wanted = connection.from_arrow(schema.arrow(()).empty_table())
+    present = tuple(column.name for column in schema.optional if column.name in found)
+    wanted = connection.from_arrow(schema.arrow(present).empty_table())
     for name, kind in zip(wanted.columns, map(str, wanted.types), strict=True):
         if name == GEOMETRY:
             continue  # spatial reads it as GEOMETRY, not as the bytes it is stored in
@@ -71,4 +79,6 @@ def _can_stand_for(found: str, wanted: str) -> bool:
         return any(number in found for number in _NUMBERS) and "(" not in found.replace("DECIMAL(", "")
     if wanted.startswith("TIMESTAMP"):
         return found.startswith("TIMESTAMP")
+    if wanted.endswith("]"):  # Parquet does not keep the length of a list
+        return found.endswith("]") and _can_stand_for(found.rpartition("[")[0], wanted.rpartition("[")[0])
     return found == wanted

@@ -166,3 +166,14 @@ def run(
         return connection.execute(statement.text, given)
     except duckdb.Error as error:
         raise QueryError(f"{str(error).strip()}", where=f"sql/{name}.sql") from error
+
+
+def create_view(connection: duckdb.DuckDBPyConnection, name: str, *, alias: str = "") -> None:
+    """Make a view of a statement without parameters, named by its file or `alias`."""
+    connection.sql(load_sql(name).text).create_view(alias or name.rpartition("/")[2])
+
+
+def materialise(connection: duckdb.DuckDBPyConnection, name: str, params: Mapping[str, Any] | None = None) -> None:
+    """Keep the result of a statement as a table of its file's name."""
+    table = run(connection, name, params).to_arrow_table()
+    connection.from_arrow(table).create(name.rpartition("/")[2])

@@ -10,8 +10,9 @@ import numpy as np
 import pyarrow as pa
 
 from geofleet.algorithms.clustering_kernels import radix_argsort
+from geofleet.tables.biases import BiasSummary, correct_passes
 from geofleet.tables.binding import bind_table
-from geofleet.tables.database import load_sql, run
+from geofleet.tables.database import create_view, materialise, run
 from geofleet.tables.schemas import DETECTIONS
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ NEVER_BEGUN, NEVER_ENDED = np.iinfo(np.int64).max, np.iinfo(np.int64).min  # tim
 _HASHES_OF_PASSES = "pass_hash.npy"
 _ROW = np.dtype(
     [
-        *((name, np.float64) for name in ("lon", "lat", "n_frames", "spread_m2", "class_confidence")),
+        *((name, np.float64) for name in ("lon", "lat", "var_m2", "class_confidence")),
         *((name, np.int64) for name in ("track_id", "t_first_us", "t_last_us")),
         *((name, np.int32) for name in ("tile_code", "pass_code", "class_code")),
         ("is_owned", np.bool_),
@@ -49,6 +50,7 @@ class Staged:
     fleet: dict[str, int]  # vehicles that report, a run
     rejected: pa.Table  # what the checks find, with the reason
     n_detections: int
+    bias: BiasSummary | None = None
 
 
 def stage_detections(
@@ -60,6 +62,8 @@ def stage_detections(
     halo_m: float,
     batch_rows: int,
     n_vehicles: int,
+    passes: Path | None = None,
+    correct_bias: bool = False,
 ) -> Staged:
     """Judge, number and tile the detections, and write a file a batch.
 
@@ -75,33 +79,40 @@ def stage_detections(
         Detections that the tiles of a batch own; a tile that owns more is split.
     n_vehicles
         Use the first so many of every run; 0 for all.
+    passes, correct_bias
+        Whether to take the range and bearing bias of each pass out first, and the `passes` table that declares how
+        large these may be.
 
     Raises
     ------
     InputError
-        The table cannot be read.
+        The table cannot be read, or biases cannot be solved for want of the information form.
     TableError
         A column is missing or mistyped.
     """
     fine_zoom = max(zoom, FINE_ZOOM)
-    bind_table(connection, DETECTIONS, detections)
-    connection.sql(load_sql("aggregate/judged").text).create_view("judged")
-    _materialise(connection, "aggregate/reporting")
+    bind_table(connection, DETECTIONS, detections, is_filled=True)
+    create_view(connection, "aggregate/judged")
+    materialise(connection, "aggregate/reporting")
     _find_suspects(connection)
-    _materialise(connection, "aggregate/copies")
-    _materialise(connection, "aggregate/fleet", {"n_vehicles": n_vehicles})
-    _materialise(connection, "aggregate/passes")
-    connection.sql(load_sql("aggregate/points").text).create_view("points")
-    _materialise(connection, "aggregate/classes")
-    _materialise(connection, "tiles/counts", {"fine_zoom": fine_zoom})
-    _materialise(connection, "tiles/leaves", {"zoom": zoom, "fine_zoom": fine_zoom, "batch_rows": batch_rows})
-    _materialise(connection, "tiles/assign", {"batch_rows": batch_rows})
+    materialise(connection, "aggregate/copies")
+    materialise(connection, "aggregate/fleet", {"n_vehicles": n_vehicles})
+    materialise(connection, "aggregate/passes")
+    create_view(connection, "aggregate/usable")
+    bias = correct_passes(connection, detections, passes) if correct_bias else None
+    if bias is None:
+        create_view(connection, "aggregate/placed")
+    create_view(connection, "aggregate/points")
+    materialise(connection, "aggregate/classes")
+    materialise(connection, "tiles/counts", {"fine_zoom": fine_zoom})
+    materialise(connection, "tiles/leaves", {"zoom": zoom, "fine_zoom": fine_zoom, "batch_rows": batch_rows})
+    materialise(connection, "tiles/assign", {"batch_rows": batch_rows})
     reach = {"fine_zoom": fine_zoom, "halo_m": halo_m, "n_around": math.ceil(halo_m / _CELL_M * 2.0**fine_zoom) or 1}
-    _materialise(connection, "tiles/readers", reach)
+    materialise(connection, "tiles/readers", reach)
     members = run(connection, "tiles/members", {"fine_zoom": fine_zoom})
     _deal(members.to_arrow_reader(BLOCK_ROWS), folder)
-    passes = connection.sql("SELECT DISTINCT pass_code, pass_hash FROM passes ORDER BY pass_code").fetchnumpy()
-    np.save(folder / _HASHES_OF_PASSES, np.asarray(passes["pass_hash"], np.uint64))
+    hashes = connection.sql("SELECT DISTINCT pass_code, pass_hash FROM passes ORDER BY pass_code").fetchnumpy()
+    np.save(folder / _HASHES_OF_PASSES, np.asarray(hashes["pass_hash"], np.uint64))
     fleet = connection.table("fleet").to_arrow_table()
     n_rows, n_usable = connection.table("reporting").aggregate("sum(n_rows), sum(n_usable)").fetchall()[0]
     return Staged(
@@ -111,6 +122,7 @@ def stage_detections(
         fleet=dict(zip(fleet["run_id"].to_pylist(), fleet["n_reporting"].to_pylist(), strict=True)),
         rejected=_rejected(connection, n_invalid=(n_rows or 0) - (n_usable or 0)),
         n_detections=n_rows or 0,
+        bias=bias,
     )
 
 
@@ -130,19 +142,13 @@ def read_rows(path: Path) -> Columns:
     return columns | {"pass_hash": hashes[columns["pass_code"]]}
 
 
-def _materialise(connection: duckdb.DuckDBPyConnection, name: str, params: dict[str, Any] | None = None) -> None:
-    """Keep the result of a statement as a table of its file's name."""
-    table = run(connection, name, params).to_arrow_table()
-    connection.from_arrow(table).create(name.rpartition("/")[2])
-
-
 def _find_suspects(connection: duckdb.DuckDBPyConnection) -> None:
     """Keep the passes that may repeat a key: by bit strings or, when the ids are too spread for these, all of them."""
     low, high, n_passes = (
         connection.table("reporting").aggregate("min(track_low), max(track_high), count(n_usable)").fetchall()[0]
     )
     if low is not None and (high - low + 1) * n_passes <= _MAX_ID_BITS:
-        _materialise(connection, "aggregate/suspects", {"low": low, "high": high})
+        materialise(connection, "aggregate/suspects", {"low": low, "high": high})
     else:
         connection.table("reporting").filter("n_usable > 0").project("run_id, pass_id").distinct().create("suspects")
 

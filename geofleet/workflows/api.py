@@ -102,10 +102,14 @@ def aggregate(
     *,
     method: str = "dbscan",
     semantic: str = "first",
+    passes: GeoDataFrame | None = None,
     n_vehicles: int | None = None,
     **overrides: Any,
 ) -> GeoDataFrame:
     """Cluster detections and fuse them into a sign map; any key of a scenario may be overridden, e.g. `eps_m=3`.
+
+    With `passes`, support is relative to the passes that had a place in view; with `correct_bias=True`, the bias of
+    each pass is taken out first.
 
     Raises
     ------
@@ -118,7 +122,10 @@ def aggregate(
     with TemporaryDirectory() as folder:
         source, out = Path(folder) / "detections.parquet", Path(folder) / "fused.parquet"
         write_table(DETECTIONS, from_geodataframe(DETECTIONS, detections), source)
-        aggregate_step.aggregate(source, out, config=config, n_vehicles=n_vehicles)
+        driven = Path(folder) / "passes.parquet" if passes is not None else None
+        if driven:
+            write_table(PASSES, from_geodataframe(PASSES, passes), driven)
+        aggregate_step.aggregate(source, out, config=config, n_vehicles=n_vehicles, passes=driven)
         return _read(SIGNS, out)
 
 

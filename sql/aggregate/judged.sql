@@ -3,8 +3,9 @@
 -- reads: detections
 -- params: none
 -- writes: reason VARCHAR, run_id VARCHAR, vehicle_id VARCHAR, pass_id VARCHAR, track_id BIGINT, sign_class VARCHAR,
---         lon DOUBLE, lat DOUBLE, n_frames BIGINT, spread_m2 DOUBLE, class_confidence DOUBLE, t_first_us BIGINT,
---         t_last_us BIGINT
+--         lon DOUBLE, lat DOUBLE, n_frames BIGINT, var_m2 DOUBLE, class_confidence DOUBLE, t_first_us BIGINT,
+--         t_last_us BIGINT, info_lon DOUBLE, info_lat DOUBLE, info_matrix DOUBLE[], info_vector DOUBLE[],
+--         info_s0 DOUBLE, info_dof DOUBLE
 SELECT
     CASE
         WHEN run_id IS NULL OR vehicle_id IS NULL OR pass_id IS NULL OR track_id IS NULL THEN 'key missing'
@@ -21,8 +22,19 @@ SELECT
     bbox.xmin AS lon,
     bbox.ymin AS lat,
     n_frames,
-    (sigma_e_m * sigma_e_m + sigma_n_m * sigma_n_m) / 2 AS spread_m2, -- mean variance of an axis
+    -- variance of the mean over the frames, an axis; what is missing widens it: a spread counts as 1 m, frames as one
+    CASE
+        WHEN isfinite(sigma_e_m * sigma_e_m + sigma_n_m * sigma_n_m)
+            THEN (sigma_e_m * sigma_e_m + sigma_n_m * sigma_n_m) / 2
+        ELSE 1.0
+    END / greatest(coalesce(n_frames, 1), 1) AS var_m2,
     class_confidence,
     epoch_us(t_first) AS t_first_us,
-    epoch_us(t_last) AS t_last_us
+    epoch_us(t_last) AS t_last_us,
+    info_lon,
+    info_lat,
+    info_matrix::DOUBLE[] AS info_matrix,
+    info_vector::DOUBLE[] AS info_vector,
+    info_s0,
+    info_dof
 FROM detections

@@ -3,9 +3,8 @@
 -- reads: @aggregate/points, @aggregate/classes, @tiles/readers
 -- params: $fine_zoom (integer, zoom of the cells)
 -- writes: batch INTEGER, tile_code INTEGER, is_owned BOOLEAN, pass_code INTEGER, track_id BIGINT, class_code INTEGER,
---         lon DOUBLE, lat DOUBLE, n_frames DOUBLE, spread_m2 DOUBLE, class_confidence DOUBLE, t_first_us BIGINT,
---         t_last_us BIGINT
-WITH placed AS (
+--         lon DOUBLE, lat DOUBLE, var_m2 DOUBLE, class_confidence DOUBLE, t_first_us BIGINT, t_last_us BIGINT
+WITH located AS (
     SELECT
         *,
         (lon + 180) / 360 * (1 << $fine_zoom) AS x, -- as in tiles/counts
@@ -21,15 +20,14 @@ SELECT
     class_code,
     lon,
     lat,
-    coalesce(n_frames, 'nan'::DOUBLE) AS n_frames,
-    coalesce(spread_m2, 'nan'::DOUBLE) AS spread_m2,
+    var_m2,
     coalesce(class_confidence, 'nan'::DOUBLE) AS class_confidence,
     coalesce(t_first_us, 9223372036854775807) AS t_first_us,
     coalesce(t_last_us, -9223372036854775807 - 1) AS t_last_us
-FROM placed
+FROM located
 JOIN classes USING (sign_class)
 JOIN readers
-    ON readers.run_id = placed.run_id
+    ON readers.run_id = located.run_id
     AND cell_x = floor(x)::INTEGER % (1 << $fine_zoom)
     AND cell_y = floor(y)::INTEGER
 WHERE x BETWEEN west AND east AND y BETWEEN north AND south
