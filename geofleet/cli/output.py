@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,20 +17,41 @@ if TYPE_CHECKING:
 
     from geofleet.steps.evaluate import EvaluateResult
 
+_SECONDS_A_LINE = 15
+
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Draw a progress bar on a terminal; elsewhere (CI, a pipe) say on standard error what is being done."""
+    """Draw a progress bar with the time left on a terminal; elsewhere (CI, a pipe) tell it line by line, seldom."""
     if not sys.stderr.isatty():
         sys.stderr.write(f"{label} ...\n")
-        yield lambda _done, _total: None
+        yield _Lines(label).tell
         return
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(label, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+class _Lines:
+    """Progress as lines, one in a quarter of a minute."""
+
+    def __init__(self, label: str) -> None:
+        self._label, self._begin = label, time.monotonic()
+        self._last, self._first = self._begin, 0
+
+    def tell(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if now - self._last < _SECONDS_A_LINE:
+            if self._last == self._begin and not self._first:
+                self._first = done  # what was there before does not say how fast the rest goes
+            return
+        left_s = (now - self._begin) / max(done - self._first, 1) * (total - done)
+        sys.stderr.write(f"{self._label}: {done} of {total}, about {left_s:.0f} s left\n")
+        self._last = now
 
 
 def print_result(result: Any, *, as_json: bool) -> None:

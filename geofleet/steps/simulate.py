@@ -54,7 +54,13 @@ FOLDER_A_VEHICLE = 1000
 N_BUCKETS = 32
 
 _OUTPUTS = {"runs.parquet", "reference.parquet", "passes.parquet", "detections", "truth", "_manifest.json"}
-_LIMITS = {"n_vehicles": (1, 100_000), "n_replicates": (1, 100_000), "seed": (0, 2**63 - 1), "n_workers": (1, 1024)}
+_LIMITS = {
+    "n_vehicles": (1, 100_000),
+    "n_replicates": (1, 100_000),
+    "first_replicate": (0, 100_000),
+    "seed": (0, 2**63 - 1),
+    "n_workers": (1, 1024),
+}
 _SHAPING = ("scene", "fleet", "sensor", "tracking", "mixed")
 
 
@@ -104,6 +110,7 @@ def simulate(
     config: Config,
     n_vehicles: int,
     n_replicates: int = 1,
+    first_replicate: int = 0,
     seed: int = 0,
     n_workers: int = 2,
     progress: Progress | None = None,
@@ -123,6 +130,8 @@ def simulate(
         The sections scene, fleet, sensor and tracking and the kinds of sensors are used.
     n_vehicles, n_replicates, seed
         Passes a run, number of runs, and the seed of all of them.
+    first_replicate
+        Number of the first run: runs may be simulated apart, and are the same.
     n_workers
         Threads.
     progress
@@ -135,21 +144,25 @@ def simulate(
     InputError
         A table cannot be used, no sign is near the drive, the drive does not move, or `out` holds something else.
     """
-    _check_numbers(n_vehicles=n_vehicles, n_replicates=n_replicates, seed=seed, n_workers=n_workers)
+    numbers = {"n_vehicles": n_vehicles, "n_replicates": n_replicates, "first_replicate": first_replicate}
+    _check_numbers(**numbers, seed=seed, n_workers=n_workers)
     _check_out(out)
     fleet = load_fleet(read_layer(signs).table, drive, source=signs, config=config)
     digest = _digest(config, signs, drive)
-    run_ids = tuple(_run_id(config.scenario, seed, replicate, digest) for replicate in range(n_replicates))
+    replicates = range(first_replicate, first_replicate + n_replicates)
+    run_ids = tuple(_run_id(config.scenario, seed, replicate, digest) for replicate in replicates)
     tally = _Tally(fleet, progress or _silent, n_vehicles * n_replicates)
     with atomic_path(out) as draft, ThreadPoolExecutor(n_workers) as pool:
         draft.mkdir()
         runs = [
             _Run(run_id, seed, replicate, n_vehicles, draft, fleet.billboards(seed, replicate))
-            for run_id, replicate in sorted(zip(run_ids, range(n_replicates), strict=True))  # by key
+            for run_id, replicate in sorted(zip(run_ids, replicates, strict=True))  # by key
         ]
         pieces = (piece for run in runs for piece in _parts_of_run(fleet, run, tally, pool))
         write_pieces(PASSES, pieces, draft / "passes.parquet")
-        table = runs_table(config, run_ids, seed=seed, n_vehicles=n_vehicles, digest=digest)
+        table = runs_table(
+            config, dict(zip(run_ids, replicates, strict=True)), seed=seed, n_vehicles=n_vehicles, digest=digest
+        )
         write_table(RUNS, table, draft / "runs.parquet")
         write_table(REFERENCE, _together(REFERENCE, tally.references), draft / "reference.parquet")
     result = SimulateResult(

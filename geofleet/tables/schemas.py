@@ -323,6 +323,28 @@ SCORES = Schema(
     optional=(_c("cardinality_m2?", FLOAT, "gate_m² / 2 (fp + fn) / tp; with mse_m2 the two parts of gospa_m²"),),
 )
 
+STUDY_SCORES = Schema(
+    "study_scores",
+    "the scores of a study: one row a fleet, method and fleet size, over all tiles",
+    ("scenario", "place", "setting", "method", "n_vehicles", "replicate"),
+    (
+        _c("scenario", TEXT, "name of the scenario"),
+        _c("place", TEXT, "where: the drive, or a name that the study gives it"),
+        _c("setting", TEXT, "what the scenario is changed in, e.g. semantic_rate=0.98; empty when in nothing"),
+        METHOD,
+        N_VEHICLES,
+        _c("seed", INT, "seed of the study"),
+        _c("replicate", INT, "number of the fleet, from 0"),
+        RUN,
+        _c("tracker", TEXT, "front end: paper, kalman or ideal"),
+        _c("upload", TEXT, "what the method reads of a detection: mean, or information"),
+        *(c for c in (*SCORES.columns, *SCORES.optional) if c not in _SCORED and c.name not in ("tile", "concept")),
+    ),
+)
+
 SCHEMAS = MappingProxyType(
-    {s.name: s for s in (SIGNS, RUNS, REFERENCE, LANES, DRIVES, PASSES, DETECTIONS, TRUTH, MATCHES, SCORES)}
+    {
+        s.name: s
+        for s in (SIGNS, RUNS, REFERENCE, LANES, DRIVES, PASSES, DETECTIONS, TRUTH, MATCHES, SCORES, STUDY_SCORES)
+    }
 )

@@ -13,6 +13,8 @@ from geofleet.tables.schemas import BBOX, DETECTIONS, GEOMETRY, PASSES, REFERENC
 from geofleet.tables.store import build_table, lonlat
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from geofleet.algorithms.geodesy import EnuFrame
@@ -145,15 +147,15 @@ def reference_table(scene: Scene, run_id: str, n_passes: Ints, n_frames: Ints) -
     return build_table(REFERENCE, columns | counts, geometry=lonlat(scene.table))
 
 
-def runs_table(config: Config, run_ids: tuple[str, ...], *, seed: int, n_vehicles: int, digest: str) -> pa.Table:
-    """Return a row a replicate, in their order."""
+def runs_table(config: Config, replicate_of: Mapping[str, int], *, seed: int, n_vehicles: int, digest: str) -> pa.Table:
+    """Return a row a run, given the number of its replicate."""
     return build_table(
         RUNS,
         {
-            "run_id": list(run_ids),
+            "run_id": list(replicate_of),
             "scenario": config.scenario,
             "seed": seed,
-            "replicate": np.arange(len(run_ids)),
+            "replicate": list(replicate_of.values()),
             "n_vehicles": n_vehicles,
             "tracker": config.tracking.tracker,
             "upload": "information" if config.tracking.sends_information else "mean",

@@ -1,0 +1,1 @@
+"""Studies: many simulated fleets, many methods, and what follows from their scores."""
