@@ -41,17 +41,18 @@ class _Lines:
 
     def __init__(self, label: str) -> None:
         self._label, self._begin = label, time.monotonic()
-        self._last, self._first = self._begin, 0
+        self._last = self._begin
+        self._first: int | None = None
 
     def tell(self, done: int, total: int) -> None:
+        """Say how much is done; what was there before does not say how fast the rest goes."""
         now = time.monotonic()
-        if now - self._last < _SECONDS_A_LINE:
-            if self._last == self._begin and not self._first:
-                self._first = done  # what was there before does not say how fast the rest goes
-            return
-        left_s = (now - self._begin) / max(done - self._first, 1) * (total - done)
-        sys.stderr.write(f"{self._label}: {done} of {total}, about {left_s:.0f} s left\n")
-        self._last = now
+        if self._first is None:
+            self._first = done
+        if now - self._last >= _SECONDS_A_LINE:
+            self._last, fresh = now, done - self._first
+            left = f", about {(now - self._begin) / fresh * (total - done):.0f} s left" if fresh else ""
+            sys.stderr.write(f"{self._label}: {done} of {total}{left}\n")
 
 
 def print_result(result: Any, *, as_json: bool) -> None:

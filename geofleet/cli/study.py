@@ -60,12 +60,12 @@ Prior = Annotated[
     typer.Option("--prior", help="Map that joint-prior starts from; an outdated copy of the scene by default."),
 ]
 Processes = Annotated[int, typer.Option("--workers", min=1, help="Processes; the result does not depend on it.")]
-StudyOut = Annotated[Path, typer.Option("--out", help="Folder of the study; what is done there is not done again.")]
+StudyOut = Annotated[Path, typer.Option("--out", help="Folder of studies; what is done there is not done again.")]
 
 
 @study_app.command("compare")
 def study_compare(
-    out: StudyOut = Path("study/compare"),
+    out: StudyOut = Path("study"),
     signs: SignsOption = None,
     drive: DrivesOption = None,
     scenario: Scenarios = "paper",
@@ -109,7 +109,7 @@ def study_compare(
 
 @study_app.command("fleet-size")
 def study_fleet_size(
-    out: StudyOut = Path("study/fleet-size"),
+    out: StudyOut = Path("study"),
     signs: SignsOption = None,
     drive: DrivesOption = None,
     scenario: Scenarios = "paper",

@@ -97,12 +97,12 @@ def write_study(
     draw: Callable[[Path, list[dict[str, Any]]], None],
     more: Mapping[str, Rows] | None = None,
 ) -> tuple[list[dict[str, Any]], tuple[Path, ...]]:
-    """Write rows (Parquet and CSV), their summary and figures into the folder `results` of a study.
+    """Write rows (Parquet and CSV), their summary and figures into the folder of its name in that of a study.
 
     Parameters
     ----------
     name
-        Of the study, for the manifest.
+        Of the study.
     rows
         Of `run_study`.
     draw
@@ -114,7 +114,7 @@ def write_study(
     -------
     The summary, and the files.
     """
-    results, summary = out / "results", summarise(totals(rows))
+    results, summary = out / name, summarise(totals(rows))
     columns = [column.name for column in STUDY_SCORES.all_columns]
     table = build_table(STUDY_SCORES, {column: [row[column] for row in totals(rows)] for column in columns})
     with atomic_path(results) as draft:

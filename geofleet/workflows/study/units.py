@@ -1,4 +1,4 @@
-"""The work of a study: one replicate is simulated once, for its largest fleet, and mapped and scored many times.
+"""The work of a study: each replicate is simulated once, for its largest fleet, and mapped and scored many times.
 
 A unit is one method and fleet size of one replicate. Its scores are written as soon as they are known, to a file that
 the digest of all that shapes them names; a study that is started again goes on where it was killed.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
@@ -49,22 +50,28 @@ _LOOK_S = 0.5
 class Unit:
     """One method and fleet size of a replicate, and the file of its scores."""
 
+    replicate: int
     method: str
     n_vehicles: int
     path: Path
 
 
 @dataclass(frozen=True, slots=True)
-class Replicate:
-    """One fleet of a world, plain data: what is to be simulated, and the units that it is for."""
+class Batch:
+    """Some fleets of a world, plain data: what is to be simulated at one time, and the units that it is for."""
 
     world: World
-    number: int
     seed: int
     n_vehicles: int
     units: tuple[Unit, ...]
     in_view: bool
     prior: Path | None
+
+    @property
+    def replicates(self) -> range:
+        """The numbers of the fleets, from the first to the last that a unit needs."""
+        numbers = [unit.replicate for unit in self.units]
+        return range(min(numbers), max(numbers) + 1)
 
 
 def run_study(study: Study, folder: Path, *, n_workers: int = 1, progress: Progress | None = None) -> Rows:
@@ -92,14 +99,14 @@ def run_study(study: Study, folder: Path, *, n_workers: int = 1, progress: Progr
     units_dir.mkdir(parents=True, exist_ok=True)
     for leftover in units_dir.glob(".*"):  # of a study that was killed
         shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
-    replicates = tuple(_replicates(study, units_dir))
-    every = [unit for replicate in replicates for unit in replicate.units]
+    worlds = [_world(study, world, units_dir) for world in study.worlds]
+    every = [unit for world in worlds for unit in world.units]
     tell = progress or (lambda _done, _total: None)
-    missing = [task for task in map(_missing, replicates) if task.units]
-    for _ in run_all(run_replicate, missing, n_workers=n_workers):
+    size = math.ceil(study.n_replicates / n_workers)
+    for _ in run_all(run_batch, [batch for world in worlds for batch in _missing(world, size)], n_workers=n_workers):
         tell(sum(unit.path.is_file() for unit in every), len(every))
     tell(len(every), len(every))
-    return [row for replicate in replicates for unit in replicate.units for row in read_unit(replicate, unit)]
+    return [row for world in worlds for unit in world.units for row in read_unit(world, unit)]
 
 
 def run_all(function: Callable[[Any], Any], tasks: Sequence[Any], *, n_workers: int) -> Iterator[None]:
@@ -127,16 +134,19 @@ def run_all(function: Callable[[Any], Any], tasks: Sequence[Any], *, n_workers: 
                 future.cancel()
 
 
-def _replicates(study: Study, units_dir: Path) -> Iterator[Replicate]:
-    for world in (_sending(w, study.methods) for w in study.worlds):
-        for number in range(study.n_replicates):
-            task = Replicate(world, number, study.seed, max(study.sizes), (), study.in_view, study.prior)
-            units = tuple(
-                Unit(method.label, size, units_dir / f"{unit_digest(task, method, size)}.json")
-                for method in study.methods
-                for size in study.sizes
-            )
-            yield replace(task, units=units)
+def _world(study: Study, world: World, units_dir: Path) -> Batch:
+    """Return all units of a world."""
+    sending = _sending(world, study.methods)
+    batch = Batch(sending, study.seed, max(study.sizes), (), study.in_view, study.prior)
+    return replace(
+        batch,
+        units=tuple(
+            Unit(number, method.label, size, units_dir / f"{unit_digest(batch, method, size, number)}.json")
+            for method in study.methods
+            for size in study.sizes
+            for number in range(study.n_replicates)
+        ),
+    )
 
 
 def _sending(world: World, methods: Sequence[Method]) -> World:
@@ -147,91 +157,127 @@ def _sending(world: World, methods: Sequence[Method]) -> World:
     return replace(world, config=world.config.model_copy(update={"tracking": tracking}))
 
 
-def _missing(replicate: Replicate) -> Replicate:
-    """Return a replicate with the units that are not there yet."""
-    return replace(replicate, units=tuple(unit for unit in replicate.units if not unit.path.is_file()))
+def _missing(world: Batch, size: int) -> Iterator[Batch]:
+    """Yield batches of so many fleets with the units that are not there yet."""
+    units = [unit for unit in world.units if not unit.path.is_file()]
+    numbers = sorted({unit.replicate for unit in units})
+    for begin in range(0, len(numbers), size):
+        some = set(numbers[begin : begin + size])
+        yield replace(world, units=tuple(unit for unit in units if unit.replicate in some))
 
 
-def unit_digest(replicate: Replicate, method: Method, n_vehicles: int) -> str:
+def unit_digest(batch: Batch, method: Method, n_vehicles: int, replicate: int) -> str:
     """Return 32 hex digits over everything that shapes the scores of a unit."""
-    world, config = replicate.world, with_settings(replicate.world.config, method)
-    prior = hash_input(replicate.prior) if replicate.prior else str(USUAL_PRIOR)
+    world, config = batch.world, with_settings(batch.world.config, method)
+    prior = hash_input(batch.prior) if batch.prior else str(USUAL_PRIOR)
     parts = (
         code_digest(),
         *(hash_input(path) for path in (world.signs, world.drive)),
         config.digest(),
-        *(str(value) for value in (world.place, world.setting, replicate.seed, replicate.number)),
+        *(str(value) for value in (world.place, world.setting, batch.seed, replicate)),
         *(str(value) for value in (method.label, n_vehicles, prior if method.has_prior else "")),
-        str(replicate.n_vehicles if replicate.in_view else ""),
+        str(batch.n_vehicles if batch.in_view else ""),
     )
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
 
 
-def run_replicate(replicate: Replicate) -> None:
-    """Simulate a fleet and write the scores of its units, each when it is known."""
-    with (
-        threadpool_limits(1),
-        TemporaryDirectory(dir=replicate.units[0].path.parent, prefix=".") as name,
-    ):
-        simulated = simulate_replicate(replicate, Path(name))
-        for unit in replicate.units:
-            scores = score_unit(replicate, simulated, METHODS[unit.method], unit.n_vehicles)
-            with atomic_path(unit.path) as draft:
-                draft.write_text(json.dumps(scores), encoding="utf-8")
+def run_batch(batch: Batch) -> None:
+    """Simulate fleets and write the scores of their units, each when it is known."""
+    groups: dict[tuple[str, int], list[Unit]] = {}
+    for unit in batch.units:
+        groups.setdefault((unit.method, unit.n_vehicles), []).append(unit)
+    with threadpool_limits(1), TemporaryDirectory(dir=batch.units[0].path.parent, prefix=".") as name:
+        fleets = simulate_fleets(batch, Path(name))
+        for (label, n_vehicles), units in groups.items():
+            scores = score_fleets(batch, fleets, METHODS[label], n_vehicles)
+            for unit in units:
+                with atomic_path(unit.path) as draft:
+                    draft.write_text(json.dumps(scores[unit.replicate]), encoding="utf-8")
 
 
 @dataclass(frozen=True, slots=True)
-class Simulated:
-    """A simulated fleet in a folder of its own."""
+class Fleets:
+    """Simulated fleets in a folder of their own, by the number of their replicate."""
 
     folder: Path
-    run_id: str
-    reference: pa.Table
+    run_ids: dict[int, str]
+    references: dict[int, pa.Table]
 
-    @property
-    def path(self) -> Path:
-        """Where its tables are."""
-        return self.folder / "simulation"
+    def of(self, replicate: int) -> Path:
+        """Return a folder of detections of one fleet alone, and where its prior map is beside it."""
+        folder = self.folder / f"fleet-{replicate}"
+        if not folder.is_dir():
+            folder.mkdir()
+            run = f"run_id={self.run_ids[replicate]}"
+            (folder / run).symlink_to(self.folder / "simulation" / "detections" / run, target_is_directory=True)
+        return folder
+
+    def prior(self, replicate: int) -> Path:
+        """Return where the prior map of a fleet is."""
+        return self.folder / f"prior-{replicate}.parquet"
 
 
-def simulate_replicate(replicate: Replicate, folder: Path) -> Simulated:
-    """Simulate the fleet of a replicate, and make its prior map when a unit needs one."""
-    out = folder / "simulation"
+def simulate_fleets(batch: Batch, folder: Path) -> Fleets:
+    """Simulate the fleets of a batch, and make their prior maps when a unit needs them."""
+    out, numbers = folder / "simulation", batch.replicates
     result = simulate(
-        *(replicate.world.signs, replicate.world.drive, out),
-        config=replicate.world.config,
-        n_vehicles=replicate.n_vehicles,
-        first_replicate=replicate.number,
-        seed=replicate.seed,
+        *(batch.world.signs, batch.world.drive, out),
+        config=batch.world.config,
+        n_vehicles=batch.n_vehicles,
+        n_replicates=len(numbers),
+        first_replicate=numbers.start,
+        seed=batch.seed,
         n_workers=1,
     )
+    run_ids = dict(zip(numbers, result.run_ids, strict=True))
     reference = read_table(REFERENCE, out / "reference.parquet")
-    if any(METHODS[unit.method].has_prior for unit in replicate.units) and not replicate.prior:
-        # Every replicate has a prior of its own, which its fleet has nothing to do with.
-        stale(out / "reference.parquet", folder / "prior.parquet", USUAL_PRIOR, seed=replicate.seed + replicate.number)
-    scored = reference.filter(pc.field("n_passes_in_view") > 0) if replicate.in_view else reference
-    return Simulated(folder, result.run_ids[0], scored)
+    references = {number: reference.filter(pc.field("run_id") == run_id) for number, run_id in run_ids.items()}
+    fleets = Fleets(folder, run_ids, references)
+    if any(METHODS[unit.method].has_prior for unit in batch.units) and not batch.prior:
+        for number in numbers:  # each has a prior of its own, which its fleet has nothing to do with
+            stale(out / "reference.parquet", fleets.prior(number), USUAL_PRIOR, seed=batch.seed + number)
+    return fleets
 
 
-def score_unit(replicate: Replicate, simulated: Simulated, method: Method, n_vehicles: int) -> Rows:
-    """Map the first vehicles of a fleet and return the scores, over all tiles and one a tile."""
-    config = with_settings(replicate.world.config, method)
-    fused = simulated.folder / "fused.parquet"
-    options: dict[str, Any] = {}
-    if method.has_prior:
-        options["prior"] = replicate.prior or simulated.folder / "prior.parquet"
+def score_fleets(batch: Batch, fleets: Fleets, method: Method, n_vehicles: int) -> dict[int, Rows]:
+    """Map the first vehicles of every fleet and return the scores, over all tiles and one a tile, by replicate."""
+    if not method.has_prior:
+        fused = _map(batch, fleets, fleets.folder / "simulation" / "detections", method, n_vehicles, prior=None)
+        maps = {number: fused.filter(pc.field("run_id") == run_id) for number, run_id in fleets.run_ids.items()}
+    else:
+        maps = {
+            number: _map(
+                batch, fleets, fleets.of(number), method, n_vehicles, prior=batch.prior or fleets.prior(number)
+            )
+            for number in fleets.run_ids
+        }
+    config, scores = batch.world.config, {}
+    for number, run_id in fleets.run_ids.items():
+        reference = fleets.references[number]
+        if batch.in_view:
+            reference = reference.filter(pc.field("n_passes_in_view") > 0)
+        labels = {"run_id": run_id, "method": method.label, "n_vehicles": n_vehicles}
+        scores[number] = _scores(maps[number], reference, labels, config)
+    return scores
+
+
+def _map(
+    batch: Batch, fleets: Fleets, detections: Path, method: Method, n_vehicles: int, *, prior: Path | None
+) -> pa.Table:
+    """Return the map of the first vehicles of some fleets."""
+    out, simulation = fleets.folder / "fused.parquet", fleets.folder / "simulation"
+    given: dict[str, Any] = {"prior": prior} if prior else {}
     aggregate(
-        simulated.path / "detections",
-        fused,
-        config=config,
+        detections,
+        out,
+        config=with_settings(batch.world.config, method),
         n_vehicles=n_vehicles,
-        passes=simulated.path / "passes.parquet" if method.has_passes else None,
-        k_from=simulated.path / "reference.parquet" if method.has_oracle_k else None,
+        passes=simulation / "passes.parquet" if method.has_passes else None,
+        k_from=simulation / "reference.parquet" if method.has_oracle_k else None,
         n_workers=1,
-        **options,
+        **given,
     )
-    labels = {"run_id": simulated.run_id, "method": method.label, "n_vehicles": n_vehicles}
-    return _scores(read_table(SIGNS, fused), simulated.reference, labels, config)
+    return read_table(SIGNS, out)
 
 
 def _scores(fused: pa.Table, reference: pa.Table, labels: dict[str, Any], config: Config) -> Rows:
@@ -242,15 +288,15 @@ def _scores(fused: pa.Table, reference: pa.Table, labels: dict[str, Any], config
     return rows
 
 
-def read_unit(replicate: Replicate, unit: Unit) -> Rows:
+def read_unit(batch: Batch, unit: Unit) -> Rows:
     """Return the rows of a unit with what they are rows of."""
-    world, tracking = replicate.world, replicate.world.config.tracking
+    world, tracking = batch.world, batch.world.config.tracking
     labels = {
         "scenario": world.config.scenario,
         "place": world.place,
         "setting": world.setting,
-        "seed": replicate.seed,
-        "replicate": replicate.number,
+        "seed": batch.seed,
+        "replicate": unit.replicate,
         "tracker": tracking.tracker,
         "upload": METHODS[unit.method].upload,
     }
