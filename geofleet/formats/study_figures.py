@@ -29,7 +29,7 @@ NAMES = {
     "fp": "FP",
     "fn": "FN",
 }
-_PAPER: dict[str, Any] = {"color": "#000000", "marker": "x", "markersize": 6, "linestyle": "none", "zorder": 6}
+_PAPER: dict[str, Any] = {"marker": "x", "markersize": 6, "linestyle": "none", "zorder": 6}
 # No random ids and no date in the SVG: the same study gives the same bytes.
 _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "geofleet",
@@ -62,7 +62,7 @@ def draw_curves(
     axes: Axes,
     summary: Rows,
     *,
-    score: str,
+    score: str | None,
     across: str = "n_vehicles",
     by: str = "method",
     labels: Mapping[str, str] | None = None,
@@ -75,12 +75,14 @@ def draw_curves(
         Rows of `summarise`.
     across, by
         What is drawn along the x axis, and what tells the lines apart.
+    score
+        Which score of the rows is drawn; None when they are of one, or told apart by it.
     labels
         What the legend calls the groups.
     """
     names = list(dict.fromkeys(row[by] for row in summary))
     for name, colour, mark, dash in zip(names, cycle(COLOURS), cycle(MARKS), cycle(DASHES), strict=False):
-        rows = [r for r in summary if r[by] == name and r["score"] == score and r["mean"] is not None]
+        rows = [r for r in summary if r[by] == name and score in {None, r["score"]} and r["mean"] is not None]
         x, mean = [row[across] for row in rows], [row["mean"] for row in rows]
         sd = [row["sd"] or 0.0 for row in rows]
         low = [row["mean"] if row["mean_low"] is None else row["mean_low"] for row in rows]
@@ -97,12 +99,15 @@ def draw_curves(
             capsize=2,
             label=(labels or {}).get(name, str(name)),
         )
-    axes.set_ylabel(NAMES[score])
+    if score:
+        axes.set_ylabel(NAMES[score])
 
 
-def draw_paper(axes: Axes, points: Sequence[tuple[float, float, float | None]], label: str = "the paper") -> None:
+def draw_paper(
+    axes: Axes, points: Sequence[tuple[float, float, float | None]], *, label: str, colour: str = "#000000"
+) -> None:
     """Draw points of the paper: x, mean, and standard deviation where it has one."""
     if points:
         x, mean, sd = zip(*points, strict=True)
         bars = None if None in sd else sd
-        axes.errorbar(x, mean, bars, elinewidth=0.8, capsize=3, label=label, **_PAPER)
+        axes.errorbar(x, mean, bars, elinewidth=0.8, capsize=3, label=label, color=colour, **_PAPER)

@@ -124,7 +124,7 @@ def _draw_sizes(path: Path, summary: Rows, caption: str) -> None:
         upper, lower = figure.subplots(2, 1, sharex=True)
         for axes, score in ((upper, "f1"), (lower, "gospa_m")):
             draw_curves(axes, summary, score=score)
-            draw_paper(axes, [(p.n_vehicles, p.mean, p.sd) for p in paper_curve(score)], "the paper, DBSCAN")
+            draw_paper(axes, [(p.n_vehicles, p.mean, p.sd) for p in paper_curve(score)], label="the paper, DBSCAN")
         lower.set(xlabel="vehicles", ylim=(0, None))
         upper.legend()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from geofleet.formats.study_figures import NAMES, draw_curves, draw_paper, figure_file
+from geofleet.formats.study_figures import COLOURS, NAMES, draw_curves, draw_paper, figure_file
 from geofleet.workflows.study.compare import BARS, describe
 from geofleet.workflows.study.methods import CORRECTED, JOINT
 from geofleet.workflows.study.paper import paper_curve
@@ -98,15 +98,16 @@ def draw_figures(folder: Path, summary: Rows, caption: str) -> None:
         with figure_file(folder / f"figure-{number}-{score}", caption=f"{caption}\n{BARS}") as figure:
             axes = figure.subplots()
             draw_curves(axes, summary, score=score)
-            draw_paper(axes, [(p.n_vehicles, p.mean, p.sd) for p in paper_curve(score)], "the paper, DBSCAN")
+            draw_paper(axes, [(p.n_vehicles, p.mean, p.sd) for p in paper_curve(score)], label="the paper, DBSCAN")
             axes.set(xlabel="vehicles", **({"ylim": (0, None)} if score == "gospa_m" else {}))
             axes.legend()
     own = find(summary, method=PAPER_METHOD) or find(summary, method=summary[0]["method"])
-    counts = [row for row in own if row["score"] in {"tp", "fp", "fn"}]
+    counts = [{**row, "of": NAMES[row["score"]]} for row in own if row["score"] in {"tp", "fp", "fn"}]
     with figure_file(folder / "figure-4-counts", caption=f"{caption}\n{BARS} Crosses: the paper.") as figure:
         axes = figure.subplots()
-        for score, group in ((s, find(counts, score=s)) for s in ("tp", "fp", "fn")):
-            draw_curves(axes, [{**row, "score": score, "of": NAMES[score]} for row in group], score=score, by="of")
-            draw_paper(axes, [(p.n_vehicles, p.mean, p.sd) for p in paper_curve(score)], "")
+        draw_curves(axes, counts, score=None, by="of")
+        for score, colour in zip(("tp", "fp", "fn"), COLOURS, strict=False):
+            points = [(p.n_vehicles, p.mean, p.sd) for p in paper_curve(score)]
+            draw_paper(axes, points, label="", colour=colour)
         axes.set(xlabel="vehicles", ylabel=f"signs, {own[0]['method']}", ylim=(0, None))
         axes.legend()
