@@ -195,10 +195,10 @@ def _print_comparison(result: CompareResult) -> None:
 
 
 def _print_fleet_sizes(result: FleetSizeResult) -> None:
-    names = ("method", "n_vehicles", "tracker", "upload", "tp", "fp", "fn", "f1", "paper_f1", "gospa_m_mean")
-    names += ("gospa_m_sd", "gospa_m_mean_low", "gospa_m_mean_high", "gospa_m_median", "paper_gospa_m", "paper_sd", "z")
+    names = ["method", "n_vehicles", "tracker", "upload", "tp", "fp", "fn", "f1", "paper_f1", "gospa_m_mean"]
+    names += ["gospa_m_sd", "gospa_m_mean_low", "gospa_m_mean_high", "gospa_m_median", "paper_gospa_m", "paper_sd", "z"]
     typer.echo(f"\n{result.caption}\nMeans over fleets, with the 95 % interval of the mean:\n")
-    print_table(names, [tuple(row[name] for name in names) for row in result.table])
+    print_table(tuple(names), [tuple(row[name] for name in names) for row in result.table])
     _print_nulls(result.table)
     if result.n_compared:
         typer.echo(
