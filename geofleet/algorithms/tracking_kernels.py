@@ -86,12 +86,10 @@ def _decide(a_xy_m: Floats, b_xy_m: Floats, gate_m: float, partner: Ints) -> Non
 
 @njit(cache=True, nogil=True)
 def _is_contested(partner: Ints, n_rows: int, row: int) -> bool:
-    if partner[row] == NONE:
-        return False
+    n_wanting = 0
     for k in range(n_rows):
-        if k != row and partner[k] == partner[row]:
-            return True
-    return False
+        n_wanting += partner[k] == partner[row] != NONE
+    return n_wanting > 1
 
 
 @njit(cache=True, nogil=True)
@@ -252,16 +250,30 @@ def majority(track: Ints, value: Ints, n_tracks: int) -> tuple[Ints, Ints]:
     for t in track:
         start[t + 1] += 1
     start = np.cumsum(start)
-    filled, grouped = start[:-1].copy(), np.empty(len(value), dtype=np.int64)
-    for i in range(len(track)):
-        grouped[filled[track[i]]] = value[i]
-        filled[track[i]] += 1
+    candidate, ballots = np.empty(len(value), dtype=np.int64), np.empty(len(value), dtype=np.int64)
+    end = start[:-1].copy()  # a track has few distinct values: they are looked for one by one
     winner, votes = np.empty(n_tracks, dtype=np.int64), np.zeros(n_tracks, dtype=np.int64)
+    for i in range(len(track)):
+        t = track[i]
+        k = start[t]
+        while k < end[t] and candidate[k] != value[i]:
+            k += 1
+        if k == end[t]:
+            candidate[k], ballots[k], end[t] = value[i], 0, end[t] + 1
+        ballots[k] += 1
     for t in range(n_tracks):
-        ballots = np.sort(grouped[start[t] : start[t + 1]])
-        run = 0
-        for k in range(len(ballots)):
-            run = run + 1 if k and ballots[k] == ballots[k - 1] else 1
-            if run > votes[t]:
-                winner[t], votes[t] = ballots[k], run
+        for k in range(start[t], end[t]):
+            if ballots[k] > votes[t] or (ballots[k] == votes[t] and candidate[k] < winner[t]):
+                winner[t], votes[t] = candidate[k], ballots[k]
     return winner, votes
+
+
+@njit(cache=True, nogil=True)
+def spans(track: Ints, frame: Ints, n_tracks: int) -> tuple[Ints, Ints]:
+    """Return the frames of the first and the last detection of each track; detections are by frame."""
+    first, last = np.full(n_tracks, NONE), np.full(n_tracks, NONE)
+    for i in range(len(track)):
+        if first[track[i]] == NONE:
+            first[track[i]] = frame[i]
+        last[track[i]] = frame[i]
+    return first, last
