@@ -17,7 +17,7 @@ SCENARIO ?= paper
 VEHICLES ?= 50
 REPLICATES ?= 1
 SEED ?= 0
-CODE := $(shell find geofleet sql -name '*.py' -o -name '*.sql' -o -name '*.toml' -o -name '*.csv' 2>/dev/null)
+CODE := $(shell find geofleet sql -name '*.py' -o -name '*.sql' -o -name '*.toml' -o -name '*.csv' -o -name '*.html' 2>/dev/null)
 
 .PHONY: FORCE help setup demo test check ingest simulate aggregate evaluate report format lock clean
 
@@ -50,7 +50,7 @@ ingest: $(P)/signs/signs_manifest.json $(P)/lanes/lanes_manifest.json $(P)/drive
 simulate: $(P)/simulation/_manifest.json ## A fleet past the signs
 aggregate: $(P)/fused/fused_manifest.json ## Detections into a map
 evaluate: $(P)/evaluation/_manifest.json ## The map against its reference
-report: $(P)/report/_manifest.json ## The picture
+report: $(P)/report/_manifest.json ## The page, the figures, the QGIS project
 
 # Stamps of the variables above: a file that changes when, and only when, its values change.
 $(P)/.inputs: VALUES = $(MAP) $(DRIVE)
@@ -76,7 +76,7 @@ $(P)/fused/fused_manifest.json: $(P)/simulation/_manifest.json
 
 $(P)/evaluation/_manifest.json: $(P)/fused/fused_manifest.json
 	$(GEOFLEET) evaluate --map $(P)/fused/fused.parquet --reference $(P)/simulation/reference.parquet \
-	  --scenario $(SCENARIO) --out $(P)/evaluation
+	  --drive $(P)/drives/drives.parquet --scenario $(SCENARIO) --out $(P)/evaluation
 
 $(P)/report/_manifest.json: $(P)/evaluation/_manifest.json $(P)/lanes/lanes_manifest.json
 	$(GEOFLEET) report $(P)

@@ -162,17 +162,20 @@ def evaluate(
 
 @app.command()
 def report(
-    run_dir: Annotated[Path, typer.Argument(help="Folder with signs, lanes, drives, simulation and evaluation.")],
+    run_dir: Annotated[Path, typer.Argument(help="Folder of a run: an evaluation, and lanes and drives beside it.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write; RUN_DIR/report by default.")] = None,
+    run_id: Annotated[str | None, typer.Option("--run-id", help="Draw a map of this run.")] = None,
+    method: Annotated[str | None, typer.Option(help="Draw a map of this method, e.g. dbscan-first.")] = None,
+    vehicles: Annotated[int | None, typer.Option("--vehicles", help="Draw a map of this fleet size.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Draw the map of a run with its matches, as PNG and SVG.
+    """Write a page to explore a run (report.html, works offline), figures for print, and a QGIS project.
 
     Example: geofleet report data/processed
     """
     from geofleet.steps import report as step
 
-    result = step.report(run_dir, out or run_dir / "report")
+    result = step.report(run_dir, out or run_dir / "report", run_id=run_id, method=method, n_vehicles=vehicles)
     if as_json:
         print_json(asdict(result))
     else:
@@ -201,5 +204,5 @@ def demo(
         return
     typer.echo(f"\n{result.caption}\n")
     print_scores(result.totals)
-    typer.echo("\nLook at the picture, and drag the GeoPackage into QGIS (every layer opens styled):")
+    typer.echo("\nOpen the page in a browser, and drag the GeoPackage into QGIS (every layer opens styled):")
     print_files(result.files)

@@ -1,7 +1,6 @@
 """QGIS styles (.qml) of the result layers: a few rules a layer, filled into small templates.
 
-Colours are Okabe and Ito's, which the colour-blind tell apart (https://jfly.uni-koeln.de/color/); the three outcomes
-differ in shape too, for print without colour. QGIS loads a `.qml` of a layer's name by itself; in a GeoPackage the
+QGIS loads a `.qml` of a layer's name by itself; in a GeoPackage the
 same text stands in `layer_styles`. Written for QGIS 3.22, read by every later 3.x.
 """
 
@@ -13,19 +12,20 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
+from geofleet.formats.palette import (
+    BLACK,
+    BLUE,
+    GOSPA_M_CLASSES,
+    GREEN,
+    GREY,
+    ORANGE,
+    SKY_BLUE,
+    VERMILLION,
+    rgb,
+)
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-BLACK, ORANGE, SKY_BLUE, GREEN = "0,0,0", "230,159,0", "86,180,233", "0,158,115"
-BLUE, VERMILLION, GREY = "0,114,178", "213,94,0", "153,153,153"
-# Light to dark, so that the order survives without colour; GOSPA_M in metres, each class up to and without its bound.
-GOSPA_M_CLASSES = (
-    (0.5, "255,255,204"),
-    (1.0, "161,218,180"),
-    (1.5, "65,182,196"),
-    (2.0, "44,127,184"),
-    (None, "37,52,148"),
-)
 
 _DOCUMENT = Template(
     """<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
@@ -117,9 +117,9 @@ def _tiles() -> tuple[Rule, ...]:
             label, upper = f"GOSPA_M from {low} m", ""
         else:
             label, upper = f"GOSPA_M {low} to {high} m", f' AND "gospa_m" < {high}'
-        rules.append(_area(label, f'"gospa_m" >= {low}{upper}', fill=f"{colour},150", line=GREY))
+        rules.append(_area(label, f'"gospa_m" >= {low}{upper}', fill=rgb(colour, 150), line=rgb(GREY)))
         low = high or low
-    null = _area("nothing matched", '"gospa_m" IS NULL', fill=VERMILLION, line=GREY, pattern="b_diagonal")
+    null = _area("nothing matched", '"gospa_m" IS NULL', fill=rgb(VERMILLION), line=rgb(GREY), pattern="b_diagonal")
     return (*rules, null)
 
 
@@ -127,37 +127,39 @@ STYLES: Mapping[str, Style] = MappingProxyType(
     {
         "scores": Style(_tiles(), "tile", ("tile", "gospa_m", "f1", "tp", "fp", "fn", "null_reason")),
         "ellipses": Style(
-            (_area("95 % error ellipse", "", fill=f"{SKY_BLUE},60", line=SKY_BLUE),),
+            (_area("95 % error ellipse", "", fill=rgb(SKY_BLUE, 60), line=rgb(SKY_BLUE)),),
             "sign_id",
             ("sign_class", "semi_major_m", "semi_minor_m", "orientation_deg"),
         ),
         "match_lines": Style(
-            (Rule("match", "", "SimpleLine", {"line_color": ORANGE, "line_width": "0.5", "line_style": "solid"}),),
+            (Rule("match", "", "SimpleLine", {"line_color": rgb(ORANGE), "line_width": "0.5", "line_style": "solid"}),),
             "fused_id",
             ("ref_class", "distance_m"),
         ),
         "reference": Style(
-            (_marker("reference sign", "", "circle", fill="255,255,255,0", line=GREY, size_mm=5.0),),
+            (_marker("reference sign", "", "circle", fill="255,255,255,0", line=rgb(GREY), size_mm=5.0),),
             "sign_id",
             ("sign_class", "source", "source_ref"),
         ),
         "fused": Style(
-            (_marker("sign of the map", "", "square", fill=BLACK, line=BLACK, size_mm=1.2),),
+            (_marker("sign of the map", "", "square", fill=rgb(BLACK), line=rgb(BLACK), size_mm=1.2),),
             "sign_id",
             ("sign_class", "source", "source_ref"),
         ),
         "matches": Style(
             (
-                _marker("found (TP)", "\"outcome\" = 'TP'", "circle", fill=GREEN, line=BLACK, size_mm=2.6),
+                _marker("found (TP)", "\"outcome\" = 'TP'", "circle", fill=rgb(GREEN), line=rgb(BLACK), size_mm=2.6),
                 _marker(
                     "not in the reference (FP)",
                     "\"outcome\" = 'FP'",
                     "cross2",
-                    fill=VERMILLION,
-                    line=VERMILLION,
+                    fill=rgb(VERMILLION),
+                    line=rgb(VERMILLION),
                     size_mm=3.6,
                 ),
-                _marker("missed (FN)", "\"outcome\" = 'FN'", "diamond", fill="255,255,255", line=BLUE, size_mm=3.8),
+                _marker(
+                    "missed (FN)", "\"outcome\" = 'FN'", "diamond", fill="255,255,255", line=rgb(BLUE), size_mm=3.8
+                ),
             ),
             "outcome",
             ("outcome", "ref_class", "fused_class", "distance_m"),

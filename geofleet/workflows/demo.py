@@ -10,10 +10,11 @@ import pyarrow.compute as pc
 
 from geofleet.config import load_config
 from geofleet.errors import InputError
+from geofleet.formats.results import GEOPACKAGE
 from geofleet.steps.aggregate import aggregate
 from geofleet.steps.evaluate import evaluate
 from geofleet.steps.ingest import ingest_drive, ingest_lanes, ingest_signs
-from geofleet.steps.report import report
+from geofleet.steps.report import PAGE, report
 from geofleet.steps.simulate import simulate
 from geofleet.tables.schemas import RUNS, SCORES
 from geofleet.tables.store import read_table
@@ -60,7 +61,7 @@ def run_demo(
             signs, drives, simulation, config=config, n_vehicles=n_vehicles, seed=SEED, n_workers=n_workers
         ),
         lambda: aggregate(simulation / "detections", fused, config=config, n_workers=n_workers),
-        lambda: evaluate(fused, simulation / "reference.parquet", out / "evaluation", config=config),
+        lambda: evaluate(fused, simulation / "reference.parquet", out / "evaluation", config=config, drive_path=drives),
         lambda: report(out, out / "report"),
     )
     for done, step in enumerate(steps):
@@ -77,7 +78,8 @@ def demo_result(out: Path) -> DemoResult:
     InputError
         There is no finished demo at `out`.
     """
-    if not (out / "report" / "map.png").is_file():
+    page = out / "report" / PAGE
+    if not page.is_file():
         raise InputError("there is no finished demo here.", where=str(out), todo=f"Run: geofleet demo --out {out}")
     scores = read_table(SCORES, out / "evaluation" / "scores.parquet")
     runs = read_table(RUNS, out / "simulation" / "runs.parquet").to_pylist()
@@ -86,5 +88,5 @@ def demo_result(out: Path) -> DemoResult:
         f"{runs[0]['n_vehicles']} simulated vehicles (scenario {runs[0]['scenario']}, tracker {runs[0]['tracker']}, "
         f"upload {runs[0]['upload']}) past real signs of central Helsinki, on a drive derived from the road graph."
     )
-    files = (out / "report" / "map.png", out / "evaluation" / "results.gpkg")
+    files = (page, out / "evaluation" / GEOPACKAGE)
     return DemoResult(caption, tuple(totals), files)

@@ -6,14 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import duckdb
-import pyarrow.parquet as pq
 
 from geofleet.errors import InputError, QueryError
 from geofleet.tables.binding import bind_table
 from geofleet.tables.database import connect
-from geofleet.tables.schemas import SCHEMAS, Schema
-
-_MARK = b"geofleet:table"
+from geofleet.tables.finding import find_tables
 
 
 def query(statement: str, data: Path) -> tuple[tuple[str, ...], list[tuple[Any, ...]]]:
@@ -47,19 +44,6 @@ def query(statement: str, data: Path) -> tuple[tuple[str, ...], list[tuple[Any, 
         raise QueryError(f"{str(error).strip()}", todo=f"Tables here: {', '.join(views)}.") from None
     finally:
         connection.close()
-
-
-def find_tables(data: Path) -> dict[str, tuple[Schema, Path]]:
-    """Return schema and path of every geofleet table below a folder, by the name of its view."""
-    views: dict[str, tuple[Schema, Path]] = {}
-    for path in sorted(data.rglob("*.parquet")):
-        mark = (pq.read_metadata(path).metadata or {}).get(_MARK, b"").decode()
-        if mark not in SCHEMAS:
-            continue
-        levels = [parent for parent in path.parents if "=" in parent.name]
-        root = levels[-1].parent if levels else path
-        views.setdefault(root.stem, (SCHEMAS[mark], root))
-    return views
 
 
 def _read_statement(statement: str) -> str:

@@ -1,0 +1,265 @@
+"""What a page says: every number with its unit, every gap with its reason."""
+
+from __future__ import annotations
+
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from geofleet.steps.report.contents import Contents
+    from geofleet.steps.report.scene import Scene
+    from geofleet.steps.report.study import Study
+
+OSM_NOTICE = "Map data © OpenStreetMap contributors, Open Database License (ODbL)."
+NOTHING = "\N{EN DASH}"
+_MOST_TILES, _MOST_ROWS = 12, 40
+_SECTIONS = (
+    ("map", "Map"),
+    ("tiles", "Worst tiles"),
+    ("errors", "Errors"),
+    ("classes", "Classes"),
+    ("fleet", "How many vehicles?"),
+    ("scores", "Scores"),
+    ("provenance", "Where it comes from"),
+)
+_CARDS = (
+    ("gospa_m", "GOSPA_M", "m"),
+    ("f1", "F1", ""),
+    ("precision", "Precision", ""),
+    ("recall", "Recall", ""),
+    ("rmse_m", "RMSE_M", "m"),
+)
+_COLUMNS = (
+    ("run_id", "run"),
+    ("method", "method"),
+    ("n_vehicles", "vehicles"),
+    ("tp", "TP"),
+    ("fp", "FP"),
+    ("fn", "FN"),
+    ("precision", "precision"),
+    ("recall", "recall"),
+    ("f1", "F1"),
+    ("rmse_m", "RMSE_M (m)"),
+    ("gospa", "GOSPA (m)"),
+    ("gospa_m", "GOSPA_M (m)"),
+)
+
+
+def describe(contents: Contents, scene: Scene, study: Study) -> dict[str, Any]:
+    """Return every text and table of the page, by its name in the template."""
+    shown = contents.shown
+    return {
+        "version": metadata.version("geofleet"),
+        "title": title(contents),
+        "badges": _badges(contents),
+        "subtitle": subtitle(contents),
+        "sections": _SECTIONS,
+        "cards": _cards(contents),
+        "score_note": _score_note(contents),
+        "map_note": _map_note(contents, scene),
+        "half_gate": _plain(shown["gate_m"] ** 2 / 2),
+        "gate": _plain(shown["gate_m"]),
+        "tiles": [_tile(tile, shown) for tile in scene.tiles[:_MOST_TILES]],
+        "n_more_tiles": max(0, scene.n_tiles - _MOST_TILES),
+        "errors_note": _errors_note(scene),
+        "classes_note": "what has no partner is in the last column (missed) and the last row (not in the reference).",
+        "curves_note": _curves_note(study),
+        "no_curves": _NO_CURVES,
+        **_scores(contents),
+        "provenance": _provenance(contents),
+        "runs": contents.runs[:_MOST_ROWS],
+        "steps": [_step(path, manifest) for path, manifest in contents.manifests],
+        "versions": _versions(manifest for _, manifest in contents.manifests),
+        "footer": " ".join(
+            [f"geofleet {metadata.version('geofleet')}.", *([OSM_NOTICE] if contents.is_from_osm else [])]
+        ),
+    }
+
+
+_NO_CURVES = (
+    "No study is here and the evaluation has one fleet size, so there is no curve. geofleet study fleet-size "
+    "--out RUN_DIR/study simulates fleets of 5 to 50 vehicles; then report RUN_DIR again."
+)
+
+
+def title(contents: Contents) -> str:
+    """Name the map and its fleet."""
+    shown, run = contents.shown, contents.run
+    size = shown["n_vehicles"]
+    if run is not None:
+        return f"Sign map of {size} simulated vehicles"
+    return f"Sign map of {size} vehicles" if size else "Sign map"
+
+
+def subtitle(contents: Contents) -> str:
+    """Say how the map was made and what it was scored against."""
+    shown, run = contents.shown, contents.run
+    parts = [f"method {shown['method']}"]
+    if run is not None:
+        parts.append(f"scenario {run['scenario']}, tracker {run['tracker']}, upload {run['upload']}")
+    n = shown["tp"] + shown["fn"]
+    sources = sorted(set(contents.reference.get("source", ())))
+    parts.append(f"scored against {n} signs" + (f" of {', '.join(sources[:3])}" if sources else ""))
+    return " · ".join(parts)
+
+
+def _badges(contents: Contents) -> list[dict[str, Any]]:
+    """Label what is not recorded."""
+    badges = []
+    if contents.run is not None:
+        badges.append({"text": "simulated detections", "warns": True})
+    if contents.is_drive_derived:
+        badges.append({"text": "derived drive", "warns": True})
+    return badges
+
+
+def _cards(contents: Contents) -> list[dict[str, str]]:
+    """Return a card a score, with its interval, and one of the counts."""
+    shown = contents.shown
+    intervals = {row["score"]: row for row in contents.intervals if row["low"]}
+    cards = []
+    for name, label, unit in _CARDS:
+        interval = intervals.get(name)
+        note = f"95 %: {float(interval['low']):.2f} to {float(interval['high']):.2f}" if interval else "no interval"
+        if shown[name] is None:
+            note = shown["null_reason"] or ""
+        cards.append({"name": label, "value": _number(shown[name], 3), "unit": unit, "note": note})
+    counts = f"{shown['tp']} / {shown['fp']} / {shown['fn']}"
+    return [*cards, {"name": "TP / FP / FN", "value": counts, "unit": "", "note": "found / false / missed signs"}]
+
+
+def _score_note(contents: Contents) -> str:
+    """Say what a score means, and what its interval is for."""
+    shown = contents.shown
+    first = (
+        f"GOSPA_M = √(MSE_M + c²/2 · (FN + FP) / TP) with c = {_plain(shown['gate_m'])} m: 0 for a perfect map, "
+        f"smaller is better. A match is nearer than c and agrees in {_MATCH_ON[shown['match_on']]}. "
+    )
+    interval = next((row for row in contents.intervals if row["score"] == "gospa_m" and row["low"]), None)
+    if interval is None:
+        return first + "There is no interval: see intervals.csv."
+    estimand = interval["estimand"].replace("gospa_m", "score")
+    note = f" Beware: {interval['note']}." if interval["note"] else ""
+    return f"{first}Intervals are for {estimand} ({interval['interval_method']}).{note}"
+
+
+_MATCH_ON = {"class": "class", "concept": "concept", "none": "nothing else"}
+
+
+def _map_note(contents: Contents, scene: Scene) -> str:
+    """Explain the map's marks and say what is left out of it."""
+    sentences = ["East and north in metres."]
+    if scene.n_outcomes > len(scene.outcomes):
+        sentences.append(f"Of {scene.n_outcomes:,} signs the {len(scene.outcomes):,} of the worst tiles are drawn.")
+    if contents.lanes is None:
+        sentences.append("The run has no lanes table, so no roads are drawn.")
+    if contents.drives is None:
+        sentences.append("The run has no drives table, so no drive is drawn.")
+    if not scene.ellipses:
+        sentences.append("The map says nothing about its errors, so there are no ellipses.")
+    tiles = "Tiles are shaded by GOSPA_M, light (good) to dark, and hatched where nothing matched."
+    return " ".join([*sentences, tiles, *([OSM_NOTICE] if contents.is_from_osm else [])])
+
+
+def _tile(tile: Mapping[str, Any], shown: Mapping[str, Any]) -> dict[str, Any]:
+    low, high = tile["ring"].min(axis=0), tile["ring"].max(axis=0)
+    total = shown["gospa"] ** 2
+    return {
+        **{name: tile[name] for name in ("tile", "tp", "fp", "fn")},
+        **{name: _number(tile[name], 3) for name in ("gospa_m", "f1", "rmse_m")},
+        "share": f"{tile['gospa'] ** 2 / total:.0%}" if total else NOTHING,
+        "box": f"{low[0]:.1f} {low[1]:.1f} {high[0]:.1f} {high[1]:.1f}",
+    }
+
+
+def _errors_note(scene: Scene) -> str:
+    if scene.shift_m is None:
+        return ""
+    east, north = scene.shift_m
+    text = f"On average the map lies {abs(east):.2f} m {'east' if east >= 0 else 'west'} and {abs(north):.2f} m "
+    text += f"{'north' if north >= 0 else 'south'} of its reference. "
+    if scene.n_with_ellipse:
+        share = scene.n_inside / scene.n_with_ellipse
+        text += f"{scene.n_inside} of {scene.n_with_ellipse} found signs ({share:.0%}) have their reference inside "
+        text += "their 95 % error ellipse."
+    return text
+
+
+def _curves_note(study: Study) -> str:
+    runs = max((curve.n_runs for curve in study.curves), default=0)
+    text = f"Mean over up to {runs} runs, from {study.source}; bands are 95 % intervals of the mean, bars one sd."
+    return text + (" Diamonds are the paper's own points, with its sd." if study.paper else "")
+
+
+def _scores(contents: Contents) -> dict[str, Any]:
+    """Return the table of scores, the map drawn first."""
+    totals = sorted(contents.totals, key=lambda total: total is not contents.shown)
+    rows = [
+        {"shown": total is contents.shown, "cells": [_cell(total[name]) for name, _ in _COLUMNS]}
+        for total in totals[:_MOST_ROWS]
+    ]
+    several = "One row a run, method and fleet size; the map drawn above is marked."
+    return {
+        "scores_note": several if len(totals) > 1 else "Over all tiles and concepts.",
+        "score_columns": [{"name": label, "text": name in ("run_id", "method")} for name, label in _COLUMNS],
+        "score_rows": rows,
+        "n_more_scores": max(0, len(totals) - _MOST_ROWS),
+    }
+
+
+def _provenance(contents: Contents) -> list[str]:
+    """Say what is real and what is not."""
+    sentences = []
+    if contents.run is not None:
+        sentences.append("The detections are simulated; the signs they are of are those of the reference.")
+    else:
+        sentences.append("No table here says that anything was simulated.")
+    if contents.is_drive_derived:
+        sentences.append("The drive is derived from the road graph; nobody recorded it.")
+    if not contents.manifests:
+        sentences.append("There are no manifests, so inputs and versions are not known.")
+    return [" ".join(sentences)]
+
+
+def _step(path: str, manifest: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "name": manifest["step"],
+        "path": path,
+        "inputs": manifest["inputs"],
+        "digest": manifest["config_digest"],
+        "settings": sorted(_flat(manifest["settings"])),
+    }
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", str(value)
+
+
+def _versions(manifests: Iterable[Mapping[str, Any]]) -> str:
+    """Return the versions that the steps ran with; of a package that changed in between, all of them."""
+    found: dict[str, set[str]] = {}
+    for manifest in manifests:
+        for name, version in manifest["versions"].items():
+            found.setdefault(name, set()).add(version)
+    if not found:
+        return ""
+    return "Versions: " + ", ".join(f"{name} {' and '.join(sorted(found[name]))}" for name in sorted(found)) + "."
+
+
+def _cell(value: Any) -> str:
+    return _number(value, 4) if isinstance(value, float) else NOTHING if value is None else str(value)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return NOTHING if value is None else f"{value:.{digits}f}"
+
+
+def _plain(value: float) -> str:
+    """Return a setting without needless zeros: 2, 0.5."""
+    return f"{value:g}"
