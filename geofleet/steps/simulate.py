@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import groupby, islice
 from typing import TYPE_CHECKING
 from zlib import crc32
 
@@ -26,6 +28,7 @@ from geofleet.tables.manifest import hash_path, write_manifest
 from geofleet.tables.schemas import DETECTIONS, PASSES, REFERENCE, RUNS, TRUTH
 from geofleet.tables.simulated import (
     PassIds,
+    SimulatedPass,
     detections_table,
     passes_table,
     reference_table,
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from geofleet.algorithms.billboards import Billboards
+    from geofleet.algorithms.sensing import PassSensing
     from geofleet.config import Config
     from geofleet.tables.schemas import Schema
 
@@ -49,6 +53,8 @@ if TYPE_CHECKING:
 
 VEHICLES_A_PART = 250
 """Vehicles whose tracks are in memory at once, and in one file of `truth`: part of the layout, not a setting."""
+VEHICLES_A_BATCH = 10
+"""Vehicles that a worker simulates before it makes tables of what they send: a table costs as much as two passes."""
 FOLDER_A_VEHICLE = 1000
 """Up to so many vehicles have a folder of detections each; those of larger fleets share `N_BUCKETS` by hash."""
 N_BUCKETS = 32
@@ -92,13 +98,23 @@ class _Run:
 
 
 @dataclass(frozen=True, slots=True)
-class _PassOutput:
-    """What is left of a pass when it is over; its detections too, unless they are on disk."""
+class _Batch:
+    """Some vehicles of a run that one worker simulates in a row, and the part of the run that they belong to."""
 
+    run: _Run
+    part: int
+    vehicles: range
+
+
+@dataclass(frozen=True, slots=True)
+class _BatchOutput:
+    """What is left of a batch when it is over; its detections too, unless they are on disk."""
+
+    batch: _Batch
     passes: pa.Table
     truth: pa.Table
     detections: pa.Table | None
-    frames_in_view: Ints
+    in_view: Ints  # (2, n_signs): passes and frames that had each sign in view
     n_frame_detections: int
 
 
@@ -158,8 +174,8 @@ def simulate(
             _Run(run_id, seed, replicate, n_vehicles, draft, fleet.billboards(seed, replicate))
             for run_id, replicate in sorted(zip(run_ids, replicates, strict=True))  # by key
         ]
-        pieces = (piece for run in runs for piece in _parts_of_run(fleet, run, tally, pool))
-        write_pieces(PASSES, pieces, draft / "passes.parquet")
+        outputs = _in_order(pool, partial(_simulate_batch, fleet), _batches(runs), ahead=2 * n_workers)
+        write_pieces(PASSES, _parts(outputs, tally), draft / "passes.parquet")
         table = runs_table(
             config, dict(zip(run_ids, replicates, strict=True)), seed=seed, n_vehicles=n_vehicles, digest=digest
         )
@@ -190,66 +206,114 @@ class _Tally:
         self._progress, self._total = progress, total
         self._in_view = np.zeros((2, len(fleet.scene.sign_ids)), dtype=np.int64)
 
-    def add(self, output: _PassOutput) -> None:
-        self._in_view += np.stack((output.frames_in_view > 0, output.frames_in_view))
+    def add(self, output: _BatchOutput) -> None:
+        """Count what a batch did; with the last one of a run, keep what its passes had in view, and start anew."""
+        batch = output.batch
+        self._in_view += output.in_view
         self.n_frame_detections += output.n_frame_detections
         self.n_detections += output.truth.num_rows
-        self.n_done += 1
-        self._progress(self.n_done, self._total)
-
-    def close_run(self, run_id: str) -> None:
-        """Keep what the passes of a run had in view, and start anew."""
-        self.references.append(reference_table(self._scene, run_id, *self._in_view))
-        self._in_view[:] = 0
+        for _ in batch.vehicles:
+            self.n_done += 1
+            self._progress(self.n_done, self._total)
+        if batch.vehicles.stop == batch.run.n_vehicles:
+            self.references.append(reference_table(self._scene, batch.run.run_id, *self._in_view))
+            self._in_view[:] = 0
 
 
 def _silent(_done: int, _total: int) -> None:
     """Take the place of a progress callback."""
 
 
-def _parts_of_run(fleet: Fleet, run: _Run, tally: _Tally, pool: ThreadPoolExecutor) -> Iterator[pa.Table]:
-    """Simulate one pass a vehicle, in order; write all but `passes`, which is returned part by part."""
-    for part, first in enumerate(range(0, run.n_vehicles, VEHICLES_A_PART)):
-        outputs = []
-        vehicles = range(first, min(first + VEHICLES_A_PART, run.n_vehicles))
-        for output in pool.map(partial(_simulate_pass, fleet, run), vehicles):
+def _batches(runs: list[_Run]) -> Iterator[_Batch]:
+    """Deal the vehicles of all runs, in order, to batches; a batch lies in one part."""
+    for run in runs:
+        for part, first in enumerate(range(0, run.n_vehicles, VEHICLES_A_PART)):
+            last = min(first + VEHICLES_A_PART, run.n_vehicles)
+            for begin in range(first, last, VEHICLES_A_BATCH):
+                yield _Batch(run, part, range(begin, min(begin + VEHICLES_A_BATCH, last)))
+
+
+def _in_order(
+    pool: ThreadPoolExecutor, work: Callable[[_Batch], _BatchOutput], batches: Iterator[_Batch], ahead: int
+) -> Iterator[_BatchOutput]:
+    """Yield what comes of each batch, in order, while workers are at most so many batches ahead."""
+    waiting = deque(pool.submit(work, batch) for batch in islice(batches, ahead))
+    try:
+        while waiting:
+            output = waiting.popleft().result()
+            waiting.extend(pool.submit(work, batch) for batch in islice(batches, 1))
+            yield output
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def _parts(outputs: Iterator[_BatchOutput], tally: _Tally) -> Iterator[pa.Table]:
+    """Write what the batches of each part left, all but `passes`, which is returned part by part."""
+    for _, group in groupby(outputs, key=lambda output: (output.batch.run.run_id, output.batch.part)):
+        part = []
+        for output in group:
             tally.add(output)
-            outputs.append(output)
-        truth = _together(TRUTH, [output.truth for output in outputs])
-        write_table(TRUTH, truth, _folder(run, "truth") / f"part-{part}.parquet")
-        shared = [output.detections for output in outputs if output.detections is not None]
+            part.append(output)
+        run, number = part[0].batch.run, part[0].batch.part
+        truth = _together(TRUTH, [output.truth for output in part])
+        write_table(TRUTH, truth, _folder(run, "truth") / f"part-{number}.parquet")
+        shared = [output.detections for output in part if output.detections is not None]
         if shared:
-            _write_buckets(_together(DETECTIONS, shared), run, part)
-        yield _together(PASSES, [output.passes for output in outputs])
-    tally.close_run(run.run_id)
+            _write_buckets(_together(DETECTIONS, shared), run, number)
+        yield _together(PASSES, [output.passes for output in part])
 
 
-def _simulate_pass(fleet: Fleet, run: _Run, vehicle: int) -> _PassOutput:
-    """Drive, sense, track and write the detections of one pass."""
+def _simulate_batch(fleet: Fleet, batch: _Batch) -> _BatchOutput:
+    """Simulate one pass a vehicle, in a row, and write their detections when each has a folder."""
+    passes, in_view, n_frame_detections = [], np.zeros((2, len(fleet.scene.sign_ids)), dtype=np.int64), 0
+    for vehicle in batch.vehicles:
+        driven, sensed = _simulate_pass(fleet, batch.run, vehicle)
+        frames = np.bincount(sensed.in_view.sign, minlength=in_view.shape[1])
+        in_view += np.stack((frames > 0, frames))
+        n_frame_detections += len(sensed.detections.frame)
+        passes.append(driven)
+    table = detections_table(passes, fleet.scene.classes, fleet.frame)
+    has_folders = batch.run.n_vehicles <= FOLDER_A_VEHICLE
+    if has_folders:
+        _write_folders(table, batch.run, passes)
+    return _BatchOutput(
+        batch,
+        passes_table(passes, fleet.frame),
+        truth_table(passes, fleet.scene),
+        None if has_folders else table,
+        in_view,
+        n_frame_detections,
+    )
+
+
+def _simulate_pass(fleet: Fleet, run: _Run, vehicle: int) -> tuple[SimulatedPass, PassSensing]:
+    """Drive, sense and track one pass."""
     streams = pass_streams(run.seed, replicate=run.replicate, vehicle=vehicle)
     drive = fleet.start(vehicle, streams)
     sensed = sense_pass(drive.true, fleet.scene.field, drive.kind.sensor, streams, run.billboards)
-    tracks = track_pass(sensed.detections, sensed.reported, drive.kind.tracker, streams)
-    ids = PassIds.of(run.run_id, vehicle)
-    table = detections_table(ids, tracks, fleet.scene.classes, fleet.frame, drive.times)
-    if run.n_vehicles <= FOLDER_A_VEHICLE:
-        folder = _folder(run, "detections", f"vehicle_id={ids.vehicle_id}")
-        write_table(DETECTIONS, table.drop_columns(list(DETECTIONS.partitions)), folder / "part-0.parquet")
-    return _PassOutput(
-        passes_table(
-            *(ids, sensed.reported, fleet.frame, drive.times),
-            drive_id=drive.way.drive.drive_id,
-            sensor=drive.kind.config,
-            declared=drive.kind.declared,
-            frame_spacing_m=drive.frame_spacing_m
-            if fleet.config.fleet.frame_rate_hz
-            else fleet.config.fleet.frame_spacing_m,
-        ),
-        truth_table(ids, tracks, fleet.scene),
-        None if run.n_vehicles <= FOLDER_A_VEHICLE else table,
-        np.bincount(sensed.in_view.sign, minlength=len(fleet.scene.sign_ids)),
-        len(sensed.detections.frame),
+    settings = fleet.config.fleet
+    driven = SimulatedPass(
+        ids=PassIds.of(run.run_id, vehicle),
+        drive_id=drive.way.drive.drive_id,
+        sensor=drive.kind.config,
+        declared=drive.kind.declared,
+        frame_spacing_m=drive.frame_spacing_m if settings.frame_rate_hz else settings.frame_spacing_m,
+        reported=sensed.reported,
+        times=drive.times,
+        tracks=track_pass(sensed.detections, sensed.reported, drive.kind.tracker, streams),
     )
+    return driven, sensed
+
+
+def _write_folders(detections: pa.Table, run: _Run, passes: list[SimulatedPass]) -> None:
+    """Write the detections of each vehicle into a folder of its own; rows are sorted by pass."""
+    plain, first = detections.drop_columns(list(DETECTIONS.partitions)), 0
+    for one in passes:
+        n_tracks = len(one.tracks.sign)
+        folder = _folder(run, "detections", f"vehicle_id={one.ids.vehicle_id}")
+        write_table(DETECTIONS, plain.slice(first, n_tracks), folder / "part-0.parquet")
+        first += n_tracks
 
 
 def _write_buckets(detections: pa.Table, run: _Run, part: int) -> None:

@@ -104,7 +104,8 @@ class Fleet:
 
     def start(self, vehicle: int, streams: PassStreams) -> Pass:
         """Draw the pass of a vehicle: sensor, drive, direction, the way through the lane and the speed."""
-        kind_u, drive_u, direction_u = streams.choice.random(3)
+        has_choice = len(self.kinds) > 1 or len(self.ways) > 1 or len(self.ways[0]) > 1
+        kind_u, drive_u, direction_u = streams.choice.random(3) if has_choice else (0.0, 0.0, 0.0)
         kind = next(kind for kind in self.kinds if kind_u < kind.upto_share)
         directions = self.ways[int(drive_u * len(self.ways))]
         way = directions[int(direction_u * len(directions))]

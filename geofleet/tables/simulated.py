@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 import shapely
 
 from geofleet.tables.schemas import BBOX, DETECTIONS, GEOMETRY, PASSES, REFERENCE, RUNS, TRUTH
-from geofleet.tables.store import build_table, lonlat
+from geofleet.tables.store import arrow_numbers, arrow_texts, build_table, lonlat
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -30,6 +30,12 @@ if TYPE_CHECKING:
     Times = NDArray[np.datetime64]
 
 _UPPER = np.triu_indices(4)
+_NEVER = np.datetime64("NaT", "us")
+_AS_SENT = (
+    *("frame_first", "frame_last", "n_frames", "sigma_e_m", "sigma_n_m", "cov_en_m2"),
+    *("range_mean_m", "class_confidence"),
+)
+"""Columns of `detections` that are fields of `Tracks`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,95 +52,130 @@ class PassIds:
         return cls(run_id, f"v{vehicle:05d}", f"v{vehicle:05d}-p0")
 
 
-def detections_table(
-    ids: PassIds, tracks: Tracks, classes: NDArray[np.object_], frame: EnuFrame, times: Times | None
-) -> pa.Table:
-    """Return what a pass sends; `classes` names the codes, `times` is the time of every frame."""
-    columns = {
-        "run_id": ids.run_id,
-        "vehicle_id": ids.vehicle_id,
-        "pass_id": ids.pass_id,
-        "track_id": np.arange(len(tracks.n_frames)),
-        "t_first": None if times is None else times[tracks.frame_first],
-        "t_last": None if times is None else times[tracks.frame_last],
-        "frame_first": tracks.frame_first,
-        "frame_last": tracks.frame_last,
-        "n_frames": tracks.n_frames,
-        "sigma_e_m": tracks.sigma_e_m,
-        "sigma_n_m": tracks.sigma_n_m,
-        "cov_en_m2": tracks.cov_en_m2,
-        "range_mean_m": tracks.range_mean_m,
-        "view_deg": (90.0 - np.rad2deg(tracks.azimuth_rad)) % 360.0,
-        "sign_class": pa.array(classes[tracks.class_code], pa.string()),
-        "class_confidence": tracks.class_confidence,
+@dataclass(frozen=True, slots=True)
+class SimulatedPass:
+    """What is kept of a pass: its names and sensor, the way that it believes it drove, and what it sends.
+
+    `times` is the time of every frame, `frame_spacing_m` the distance between two.
+    """
+
+    ids: PassIds
+    drive_id: str
+    sensor: SensorConfig
+    declared: Declared
+    frame_spacing_m: float
+    reported: Poses
+    times: Times | None
+    tracks: Tracks
+
+
+def detections_table(passes: Sequence[SimulatedPass], classes: NDArray[np.object_], frame: EnuFrame) -> pa.Table:
+    """Return what some passes of a run send; `classes` names the codes."""
+    columns: dict[str, object] = {name: _of_tracks(passes, name) for name in _AS_SENT}
+    columns |= _keys(passes) | {
+        "vehicle_id": _of_each(passes, [one.ids.vehicle_id for one in passes]),
+        "t_first": _times(passes, "frame_first"),
+        "t_last": _times(passes, "frame_last"),
+        "view_deg": (90.0 - np.rad2deg(_of_tracks(passes, "azimuth_rad"))) % 360.0,
+        "sign_class": _named(classes, _of_tracks(passes, "class_code")),
     }
-    if tracks.information is not None:
-        columns |= _information(tracks.information, frame)
-    return build_table(DETECTIONS, columns, geometry=frame.to_lonlat(tracks.xy_m))
+    forms = [one.tracks.information for one in passes if one.tracks.information is not None]
+    if forms:
+        columns |= _information(forms, frame)
+    return build_table(DETECTIONS, columns, geometry=frame.to_lonlat(_of_tracks(passes, "xy_m")))
 
 
-def _information(form: Information, frame: EnuFrame) -> dict[str, object]:
-    lon, lat = frame.to_lonlat(form.origin_xy_m)
-    upper = np.ascontiguousarray(form.matrix[:, *_UPPER])
+def _information(forms: list[Information], frame: EnuFrame) -> dict[str, object]:
+    lon, lat = frame.to_lonlat(np.concatenate([form.origin_xy_m for form in forms]))
+    upper = np.ascontiguousarray(np.concatenate([form.matrix[:, *_UPPER] for form in forms]))
+    vector = np.concatenate([form.vector for form in forms])
     return {
         "info_lon": lon,
         "info_lat": lat,
-        "info_matrix": pa.FixedSizeListArray.from_arrays(upper.ravel(), upper.shape[1]),
-        "info_vector": pa.FixedSizeListArray.from_arrays(form.vector.ravel(), form.vector.shape[1]),
-        "info_s0": form.s0,
-        "info_dof": form.dof,
+        "info_matrix": pa.FixedSizeListArray.from_arrays(arrow_numbers(upper.ravel()), upper.shape[1]),
+        "info_vector": pa.FixedSizeListArray.from_arrays(arrow_numbers(vector.ravel()), vector.shape[1]),
+        "info_s0": np.concatenate([form.s0 for form in forms]),
+        "info_dof": np.concatenate([form.dof for form in forms]),
     }
 
 
-def passes_table(
-    ids: PassIds,
-    reported: Poses,
-    frame: EnuFrame,
-    times: Times | None,
-    *,
-    drive_id: str,
-    sensor: SensorConfig,
-    declared: Declared,
-    frame_spacing_m: float,
-) -> pa.Table:
-    """Return the row of a pass: the way that it believes it drove, what its sensor can see, and what it declares."""
-    path = shapely.linestrings(np.column_stack(frame.to_lonlat(reported.xy_m)))
+def passes_table(passes: Sequence[SimulatedPass], frame: EnuFrame) -> pa.Table:
+    """Return a row a pass: the way that it believes it drove, what its sensor can see, and what it declares."""
+    lonlat_deg = np.column_stack(frame.to_lonlat(np.concatenate([one.reported.xy_m for one in passes])))
+    number = np.repeat(np.arange(len(passes)), [len(one.reported.xy_m) for one in passes])
+    rows = [
+        {
+            "pass_id": one.ids.pass_id,
+            "vehicle_id": one.ids.vehicle_id,
+            "sensor_id": f"{one.ids.vehicle_id}-s0",
+            "sensor_kind": one.sensor.sensor_kind,
+            "drive_id": one.drive_id,
+            "range_m": one.sensor.range_m,
+            "fov_deg": one.sensor.fov_deg,
+            "frame_spacing_m": one.frame_spacing_m,
+            **asdict(one.declared),
+        }
+        for one in passes
+    ]
+    columns: dict[str, object] = {name: [row[name] for row in rows] for name in rows[0]}
+    ends = {
+        name: np.array([_NEVER if one.times is None else one.times[at] for one in passes], _NEVER.dtype)
+        for name, at in (("t_start", 0), ("t_end", -1))
+    }
     return build_table(
         PASSES,
-        {
-            "run_id": ids.run_id,
-            "vehicle_id": ids.vehicle_id,
-            "pass_id": ids.pass_id,
-            "sensor_id": f"{ids.vehicle_id}-s0",
-            "sensor_kind": sensor.sensor_kind,
-            "drive_id": drive_id,
-            "t_start": None if times is None else times[:1],
-            "t_end": None if times is None else times[-1:],
-            "range_m": sensor.range_m,
-            "fov_deg": sensor.fov_deg,
-            "frame_spacing_m": frame_spacing_m,
-            **asdict(declared),
-        },
-        geometry=[path],
+        columns | ends | {"run_id": passes[0].ids.run_id},
+        geometry=shapely.linestrings(lonlat_deg, indices=number),
     )
 
 
-def truth_table(ids: PassIds, tracks: Tracks, scene: Scene) -> pa.Table:
-    """Return which sign each track came from; what came from none, or from a billboard, is a ghost."""
-    is_ghost = tracks.sign < 0
-    sign = np.where(is_ghost, 0, tracks.sign)
+def truth_table(passes: Sequence[SimulatedPass], scene: Scene) -> pa.Table:
+    """Return which sign each track of some passes came from; of none, or of a billboard: a ghost."""
+    origin = _of_tracks(passes, "sign")
+    is_ghost = origin < 0
+    sign = np.where(is_ghost, 0, origin)
     true_code = scene.field.class_code[sign]
-    return build_table(
-        TRUTH,
-        {
-            "run_id": ids.run_id,
-            "pass_id": ids.pass_id,
-            "track_id": np.arange(len(tracks.sign)),
-            "ref_sign_id": pa.array(scene.sign_ids[sign], pa.string(), mask=is_ghost),
-            "ref_sign_class": pa.array(scene.classes[true_code], pa.string(), mask=is_ghost),
-            "semantic_correct": ~is_ghost & (true_code == tracks.class_code),
-            "is_ghost": is_ghost,
-        },
+    columns = {
+        "ref_sign_id": _named(scene.sign_ids, np.where(is_ghost, -1, sign)),
+        "ref_sign_class": _named(scene.classes, np.where(is_ghost, -1, true_code)),
+        "semantic_correct": ~is_ghost & (true_code == _of_tracks(passes, "class_code")),
+        "is_ghost": is_ghost,
+    }
+    return build_table(TRUTH, _keys(passes) | columns)
+
+
+def _keys(passes: Sequence[SimulatedPass]) -> dict[str, object]:
+    return {
+        "run_id": passes[0].ids.run_id,
+        "pass_id": _of_each(passes, [one.ids.pass_id for one in passes]),
+        "track_id": np.concatenate([np.arange(len(one.tracks.sign)) for one in passes]),
+    }
+
+
+def _of_tracks(passes: Sequence[SimulatedPass], name: str) -> NDArray[Any]:
+    """Return something of all tracks of all passes, one after the other."""
+    return np.concatenate([getattr(one.tracks, name) for one in passes])
+
+
+def _of_each(passes: Sequence[SimulatedPass], texts: list[str]) -> pa.Array:
+    """Return a text a pass, repeated for each of its tracks."""
+    number = np.repeat(np.arange(len(passes)), [len(one.tracks.sign) for one in passes])
+    return arrow_texts(texts).take(arrow_numbers(number))
+
+
+def _named(names: NDArray[np.object_], code: Ints) -> pa.Array:
+    """Return the name of each code; -1 has none."""
+    index = arrow_numbers(np.where(code < 0, np.nan, code)).cast(pa.int64())
+    return arrow_texts(names.tolist()).take(index)
+
+
+def _times(passes: Sequence[SimulatedPass], name: str) -> Times:
+    """Return the time of a frame of every track, where the drive is dated."""
+    return np.concatenate(
+        [
+            np.full(len(one.tracks.sign), _NEVER) if one.times is None else one.times[getattr(one.tracks, name)]
+            for one in passes
+        ]
     )
 
 

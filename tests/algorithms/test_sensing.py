@@ -251,6 +251,13 @@ def test_a_draw_depends_on_seed_replicate_vehicle_and_pass_alone() -> None:
     assert len({draw[0] for draw in draws}) == 8  # a vehicle keeps its calibration
 
 
+def test_streams_are_those_of_numpys_spawn_keys() -> None:
+    for seed, replicate, vehicle, pass_number in ((0, 0, 0, 0), (7, 3, 99_999, 1), (2**63 - 1, 99_999, 12, 0)):
+        ours = pass_streams(seed, replicate=replicate, vehicle=vehicle, pass_number=pass_number).frames
+        spawned = np.random.SeedSequence(seed, spawn_key=(replicate, vehicle, pass_number, 2))
+        np.testing.assert_array_equal(ours.random(8), np.random.Generator(np.random.PCG64(spawned)).random(8))
+
+
 def test_one_error_source_leaves_the_draws_of_the_others_alone(street: tuple[Poses, SignField]) -> None:
     quiet = replace(NOISY, ghost_rate_per_ha=0.0)
     with_ghosts = sense_pass(*street, NOISY, pass_streams(1, replicate=0, vehicle=0)).detections
