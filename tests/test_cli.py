@@ -175,3 +175,25 @@ def test_schema_of_a_table(tmp_path):
     result = geofleet("schema", "detections", "--json", cwd=tmp_path)
     assert {"column": "track_id"}.items() <= json.loads(result.stdout)[3].items()
     assert_refused(geofleet("schema", "nothing", cwd=tmp_path), "signs, runs", cwd=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("compare", "--methods", "dbscn"), "Did you mean dbscan"),
+        (("compare", "--vehicles", "five"), "--vehicles"),
+        (("fleet-size", "--scenario", "nowhere"), "unknown scenario"),
+        (("plan", "--target", "gospa_m"), "Example: gospa_m=0.5"),
+        (("plan", "--target", "f1=0.9", "--method", "dbscan,kmeans"), "one drive, one scenario and one method"),
+    ],
+)
+def test_a_study_that_cannot_be(arguments, says, tables, tmp_path):
+    inputs = ("--signs", tables / "signs.parquet", "--drive", tables / "drives.parquet")
+    result = geofleet("study", *arguments, *inputs, "--out", "out", cwd=tmp_path)
+    assert_refused(result, says, cwd=tmp_path)
+
+
+def test_an_outdated_copy_from_the_command_line(tables, tmp_path):
+    result = geofleet("stale", tables / "signs.parquet", "prior.gpkg", "--shift-m", "1,0", "--json", cwd=tmp_path)
+    assert json.loads(result.stdout)["fates"]["removed"] > 100
+    assert_refused(geofleet("stale", tables / "signs.parquet", "out.kml", cwd=tmp_path), "no format to", cwd=tmp_path)

@@ -31,6 +31,7 @@ from geofleet.errors import ConfigError
 if TYPE_CHECKING:
     from geofleet.workflows.study.compare import CompareResult
     from geofleet.workflows.study.fleet_size import FleetSizeResult
+    from geofleet.workflows.study.plan import PlanResult
     from geofleet.workflows.study.worlds import Study
 
 app = typer.Typer()
@@ -147,6 +148,67 @@ def study_fleet_size(
         print_json(asdict(result))
         return
     _print_fleet_sizes(result)
+
+
+@study_app.command("plan")
+def study_plan(
+    target: Annotated[str, typer.Option("--target", help="What is to be reached.", metavar="SCORE=VALUE")],
+    out: StudyOut = Path("study"),
+    signs: SignsOption = None,
+    drive: Annotated[Path | None, typer.Option("--drive", help="A drive of any format; shipped by default.")] = None,
+    scenario: Annotated[str, typer.Option("--scenario", help="Name of a packaged scenario, or a TOML file.")] = "paper",
+    method: Annotated[str, typer.Option("--method", help="As --methods of study compare; one.")] = "dbscan",
+    confidence: Annotated[float, typer.Option(help="Of the interval, and the share of fleets to be safe for.")] = 0.95,
+    max_passes: Annotated[int, typer.Option(min=1, help="Most passes that are tried.")] = 200,
+    replicates: Annotated[int, typer.Option("--replicates", min=1, help="Independent fleets.")] = 20,
+    seed: Seed = 0,
+    in_view: InView = False,
+    tracker: Tracker = None,
+    prior: Prior = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    workers: Processes = N_CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Say how many passes a drive, a map, sensors and a method need for a map of a given quality.
+
+    Example: geofleet study plan --target gospa_m=0.5 --signs city.osm.pbf --drive drive.pos --method dbscan-corrected
+    """
+    from geofleet.workflows.study import plan as workflow
+    from geofleet.workflows.study.answers import parse_target
+
+    goal = parse_target(target)
+    study = _study(
+        *(out, signs, [drive] if drive else None, str(config or scenario)),
+        methods=method,
+        sizes=(max_passes,),
+        settings=_with_tracker(settings, tracker),
+        n_replicates=replicates,
+        seed=seed,
+        in_view=in_view,
+        prior=prior,
+    )
+    with progress_bar("planning") as progress:
+        result = workflow.plan(study, goal, out, level=confidence, n_workers=workers, progress=progress)
+    if as_json:
+        print_json(asdict(result))
+    else:
+        _print_plan(result)
+
+
+def _print_plan(result: PlanResult) -> None:
+    """Print the answer first, then how the score follows the passes, and the tiles."""
+    typer.echo(f"\n{result.caption}\n")
+    typer.echo("\n".join(result.answer))
+    names: tuple[str, ...] = ("n_vehicles", "n_met", "n_fleets", "median", "least", "greatest")
+    typer.echo(f"\n{result.target}, at the fleet sizes that every fleet was tried at:\n")
+    tried = [row for row in result.scores if row["n_fleets"] == result.needed.n_fleets]
+    print_table(names, [tuple(row[name] for name in names) for row in tried])
+    names = ("tile", "n_signs", "passes_at_most", "safe_at_most", "n_reached", "n_fleets", "limit_share", "main_limit")
+    typer.echo("\nBy tile (passes at most, of the sizes tried; empty: not reached):\n")
+    print_table(names, [tuple(row[name] for name in names) for row in result.tiles])
+    typer.echo("")
+    print_files(result.files)
 
 
 def _study(out: Path, signs: Path | None, drives: list[Path] | None, scenarios: str, **options: Any) -> Study:

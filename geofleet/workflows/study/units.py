@@ -136,8 +136,7 @@ def run_all(function: Callable[[Any], Any], tasks: Sequence[Any], *, n_workers: 
 
 def _world(study: Study, world: World, units_dir: Path) -> Batch:
     """Return all units of a world."""
-    sending = _sending(world, study.methods)
-    batch = Batch(sending, study.seed, max(study.sizes), (), study.in_view, study.prior)
+    batch = world_batch(study, world)
     return replace(
         batch,
         units=tuple(
@@ -147,6 +146,11 @@ def _world(study: Study, world: World, units_dir: Path) -> Batch:
             for number in range(study.n_replicates)
         ),
     )
+
+
+def world_batch(study: Study, world: World) -> Batch:
+    """Return the batch of a world before it has units."""
+    return Batch(_sending(world, study.methods), study.seed, max(study.sizes), (), study.in_view, study.prior)
 
 
 def _sending(world: World, methods: Sequence[Method]) -> World:
@@ -212,6 +216,15 @@ class Fleets:
             (folder / run).symlink_to(self.folder / "simulation" / "detections" / run, target_is_directory=True)
         return folder
 
+    def scene(self, batch: Batch, replicate: int) -> pa.Table:
+        """Return the signs that a fleet's map is scored against."""
+        scene = self.references[replicate]
+        return scene.filter(pc.field("n_passes_in_view") > 0) if batch.in_view else scene
+
+    def labels(self, replicate: int, method: Method, n_vehicles: int) -> dict[str, Any]:
+        """Return what the scores of a map are labelled with."""
+        return {"run_id": self.run_ids[replicate], "method": method.label, "n_vehicles": n_vehicles}
+
     def prior(self, replicate: int) -> Path:
         """Return where the prior map of a fleet is."""
         return self.folder / f"prior-{replicate}.parquet"
@@ -241,24 +254,26 @@ def simulate_fleets(batch: Batch, folder: Path) -> Fleets:
 
 def score_fleets(batch: Batch, fleets: Fleets, method: Method, n_vehicles: int) -> dict[int, Rows]:
     """Map the first vehicles of every fleet and return the scores, over all tiles and one a tile, by replicate."""
-    if not method.has_prior:
-        fused = _map(batch, fleets, fleets.folder / "simulation" / "detections", method, n_vehicles, prior=None)
-        maps = {number: fused.filter(pc.field("run_id") == run_id) for number, run_id in fleets.run_ids.items()}
-    else:
-        maps = {
+    maps = map_fleets(batch, fleets, method, n_vehicles)
+    return {
+        number: score_map(
+            fused, fleets.scene(batch, number), fleets.labels(number, method, n_vehicles), batch.world.config
+        )
+        for number, fused in maps.items()
+    }
+
+
+def map_fleets(batch: Batch, fleets: Fleets, method: Method, n_vehicles: int) -> dict[int, pa.Table]:
+    """Return the map of the first vehicles of every fleet, by replicate."""
+    if method.has_prior:
+        return {
             number: _map(
                 batch, fleets, fleets.of(number), method, n_vehicles, prior=batch.prior or fleets.prior(number)
             )
             for number in fleets.run_ids
         }
-    config, scores = batch.world.config, {}
-    for number, run_id in fleets.run_ids.items():
-        reference = fleets.references[number]
-        if batch.in_view:
-            reference = reference.filter(pc.field("n_passes_in_view") > 0)
-        labels = {"run_id": run_id, "method": method.label, "n_vehicles": n_vehicles}
-        scores[number] = _scores(maps[number], reference, labels, config)
-    return scores
+    fused = _map(batch, fleets, fleets.folder / "simulation" / "detections", method, n_vehicles, prior=None)
+    return {number: fused.filter(pc.field("run_id") == run_id) for number, run_id in fleets.run_ids.items()}
 
 
 def _map(
@@ -280,7 +295,8 @@ def _map(
     return read_table(SIGNS, out)
 
 
-def _scores(fused: pa.Table, reference: pa.Table, labels: dict[str, Any], config: Config) -> Rows:
+def score_map(fused: pa.Table, reference: pa.Table, labels: dict[str, Any], config: Config) -> Rows:
+    """Return the scores of a map, over all tiles and one a tile, as rows of `scores` without geometry."""
     matching: dict[str, Any] = config.evaluate.model_dump(include={"gate_m", "match_on"})
     matches = match_layers(fused, reference, labels, **matching, tile_zoom=config.aggregate.tile_zoom)
     scores = score_matches(matches, **matching).drop_columns([GEOMETRY, BBOX])
