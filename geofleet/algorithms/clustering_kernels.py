@@ -159,12 +159,18 @@ def _near_box(cells: Cells, points: Ints, others: Ints, sq_eps: float) -> Ints:
 def _are_linked(cells: Cells, core: Flags, a: int, b: int, sq_eps: float) -> bool:
     """Return whether a core of cell a is within eps of a core of cell b."""
     first = cells.first
+    if (first[a + 1] - first[a]) * (first[b + 1] - first[b]) <= _SMALL_PAIR:
+        for i in range(first[a], first[a + 1]):
+            if core[i]:
+                for j in range(first[b], first[b + 1]):
+                    if core[j] and _sq_distance(cells.coords, i, j) <= sq_eps:
+                        return True
+        return False
     mine = np.arange(first[a], first[a + 1])[core[first[a] : first[a + 1]]]
     yours = np.arange(first[b], first[b + 1])[core[first[b] : first[b + 1]]]
-    if mine.size * yours.size > _SMALL_PAIR:
-        mine = _near_box(cells, mine, yours, sq_eps)
-        if mine.size:
-            yours = _near_box(cells, yours, mine, sq_eps)
+    mine = _near_box(cells, mine, yours, sq_eps)
+    if mine.size:
+        yours = _near_box(cells, yours, mine, sq_eps)
     for i in mine:
         for j in yours:
             if _sq_distance(cells.coords, i, j) <= sq_eps:

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from pyproj import Transformer
 
-from geofleet.algorithms.geodesy import to_ecef
+from geofleet.algorithms.geodesy_kernels import ecef_points, local_axes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 COMMON_SIGMA_M = 1.0
 POSITION_DIGITS = 9  # degrees: 0.1 mm
 _HASH_DIGITS = 12
+_SUFFIX_LETTERS = 8
+ID_SHIFT = np.uint64(64 - 4 * _HASH_DIGITS)  # what an id leaves of a hash
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,19 +85,8 @@ def fuse(lon_deg: Floats, lat_deg: Floats, *, weight: Floats, pass_code: Ints, f
         (n_clusters + 1,) `first[k]:first[k + 1]` are the members of cluster k; none is empty.
     """
     lead = first[:-1]
-    lon0, lat0 = np.radians(lon_deg[lead]), np.radians(lat_deg[lead])
-    zero = np.zeros_like(lon0)
-    origin = to_ecef(lon_deg[lead], lat_deg[lead])
-    axes = np.stack(
-        (
-            np.column_stack((-np.sin(lon0), np.cos(lon0), zero)),
-            np.column_stack((-np.sin(lat0) * np.cos(lon0), -np.sin(lat0) * np.sin(lon0), np.cos(lat0))),
-            np.column_stack((np.cos(lat0) * np.cos(lon0), np.cos(lat0) * np.sin(lon0), np.sin(lat0))),
-        ),
-        axis=1,
-    )
-    offset = to_ecef(lon_deg, lat_deg) - np.repeat(origin, np.diff(first), axis=0)
-    centre, covariance, n_passes = _sum_members(offset, axes, weight, pass_code, first)
+    origin, axes = ecef_points(lon_deg[lead], lat_deg[lead]), local_axes(lon_deg[lead], lat_deg[lead])
+    centre, covariance, n_passes = _sum_members(ecef_points(lon_deg, lat_deg), origin, axes, weight, pass_code, first)
     lon, lat = _on_ground(origin, axes, centre)
     return FusedSigns(
         lon_deg=np.round(lon, POSITION_DIGITS),
@@ -134,8 +125,8 @@ def move_to_members(fused: FusedSigns, lon_deg: Floats, lat_deg: Floats) -> Fuse
 
 
 @njit(cache=True, nogil=True)
-def _sum_members(
-    offset: Floats, axes: Floats, weight: Floats, pass_code: Ints, first: Ints
+def _sum_members(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
+    xyz: Floats, origin: Floats, axes: Floats, weight: Floats, pass_code: Ints, first: Ints
 ) -> tuple[Floats, Floats, Ints]:
     """Return centroids (n, 2), covariances (n, 3: ee, nn, en) and the number of passes of every cluster."""
     n = first.size - 1
@@ -149,9 +140,10 @@ def _sum_members(
                 sums[p] = 0.0
             sums[p, 0] += weight[i]
             for axis in range(2):
-                sums[p, axis + 1] += weight[i] * (
-                    offset[i, 0] * axes[k, axis, 0] + offset[i, 1] * axes[k, axis, 1] + offset[i, 2] * axes[k, axis, 2]
-                )
+                along = 0.0
+                for side in range(3):
+                    along += (xyz[i, side] - origin[k, side]) * axes[k, axis, side]
+                sums[p, axis + 1] += weight[i] * along
         passes = sums[: p + 1]
         n_passes[k] = p + 1
         total = passes[:, 0].sum()
@@ -200,26 +192,51 @@ def vote(class_code: Ints, confidence: Floats, first: Ints) -> tuple[Ints, Float
     go to the class that comes first. The confidence is the sum of the winners' confidences (1 where missing) over the
     number of votes.
     """
-    cluster = np.repeat(np.arange(first.size - 1), np.diff(first))
     n_classes = int(class_code.max(initial=0)) + 1
-    ballots, place, votes = np.unique(cluster * n_classes + class_code, return_inverse=True, return_counts=True)
-    order = np.lexsort((ballots, -votes, ballots // n_classes))
-    winner = order[np.append(True, np.diff(ballots[order] // n_classes) > 0)] if order.size else order
-    trust = np.bincount(place, np.where(np.isfinite(confidence), confidence, 1.0), minlength=ballots.size)
-    return ballots[winner] % n_classes, trust[winner] / np.diff(first)
+    return _count_votes(class_code, confidence, first, n_classes)
 
 
-def name_hashes(hashes: NDArray[np.uint64]) -> list[str]:
-    """Return an id for every hash: "f" and 12 hexadecimal digits.
+@njit(cache=True, nogil=True)
+def _count_votes(class_code: Ints, confidence: Floats, first: Ints, n_classes: int) -> tuple[Ints, Floats]:
+    n = first.size - 1
+    winner, share = np.empty(n, np.int64), np.empty(n)
+    votes, trust = np.zeros(n_classes, np.int64), np.zeros(n_classes)
+    for k in range(n):
+        best = class_code[first[k]]
+        for i in range(first[k], first[k + 1]):
+            votes[class_code[i]] += 1
+            trust[class_code[i]] += confidence[i] if np.isfinite(confidence[i]) else 1.0
+        for i in range(first[k], first[k + 1]):
+            code = class_code[i]
+            if votes[code] > votes[best] or (votes[code] == votes[best] and code < best):
+                best = code
+        winner[k], share[k] = best, trust[best] / (first[k + 1] - first[k])
+        for i in range(first[k], first[k + 1]):
+            votes[class_code[i]], trust[class_code[i]] = 0, 0.0
+    return winner, share
+
+
+def name_hashes(hashes: NDArray[np.uint64]) -> NDArray[np.bytes_]:
+    """Return an id for every hash: "f" and the first 12 hexadecimal digits, as fixed-width bytes.
 
     Ids that collide (2⁻⁴⁸ a pair) are told apart by a suffix, in the order given.
+
+    Parameters
+    ----------
+    hashes
+        (n,) in the order of their first 48 bits.
     """
-    seen: dict[str, int] = {}
-    names = []
-    for number in hashes.tolist():
-        name = f"f{number:016x}"[: 1 + _HASH_DIGITS]
-        seen[name] = seen.get(name, 0) + 1
-        names.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
+    number = hashes.astype(np.uint64) >> ID_SHIFT
+    shifts = np.arange(4 * (_HASH_DIGITS - 1), -1, -4, dtype=np.uint64)
+    letters = np.empty((number.size, 1 + _HASH_DIGITS), np.uint8)
+    letters[:, 0] = ord("f")
+    letters[:, 1:] = np.frombuffer(b"0123456789abcdef", np.uint8)[(number[:, None] >> shifts) & np.uint64(15)]
+    names = letters.reshape(-1).view(f"S{1 + _HASH_DIGITS}")
+    repeated = np.flatnonzero(np.diff(number, prepend=number[:1] ^ np.uint64(1)) == 0)
+    if repeated.size:
+        names = names.astype(f"S{1 + _HASH_DIGITS + _SUFFIX_LETTERS}")
+        for row in repeated.tolist():
+            names[row] += b"-%d" % (row - int(np.searchsorted(number, number[row])) + 1)
     return names
 
 

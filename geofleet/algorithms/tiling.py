@@ -21,7 +21,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from geofleet.algorithms.clustering import dbscan_groups
-from geofleet.algorithms.geodesy import to_ecef
+from geofleet.algorithms.geodesy_kernels import ecef_points, local_axes, tile_planes
 from geofleet.errors import InputError
 
 if TYPE_CHECKING:
@@ -142,11 +142,11 @@ def cluster_tiles(
     eps_m, min_samples
         As for `clustering.dbscan`. Rows may come in any order: `join_open` settles what depends on it.
     """
-    ecef = to_ecef(lon_deg, lat_deg)
+    ecef = ecef_points(lon_deg, lat_deg)
     groups = tile * (int(codes.max(initial=0)) + 1) + codes
-    found = dbscan_groups(
-        _plane(ecef, tile, tile_centres_deg), groups, eps_m=eps_m, min_samples=min_samples, ecef_m=ecef
-    )
+    lon0, lat0 = np.ascontiguousarray(tile_centres_deg[:, 0]), np.ascontiguousarray(tile_centres_deg[:, 1])
+    plane = tile_planes(ecef, tile, ecef_points(lon0, lat0), local_axes(lon0, lat0))
+    found = dbscan_groups(plane, groups, eps_m=eps_m, min_samples=min_samples, ecef_m=ecef)
     member = found.labels >= 0
     owned, foreign = np.zeros((2, found.n_clusters), np.bool_)
     owned[found.labels[member & is_owned]] = True
@@ -167,15 +167,6 @@ def cluster_tiles(
         open_cluster=np.concatenate((found.labels[row], found.contested_label[mine])),
         open_is_core=np.concatenate((found.is_core[row], np.zeros(np.count_nonzero(mine), np.bool_))),
     )
-
-
-def _plane(ecef_m: Floats, tile: Ints, tile_centres_deg: Floats) -> Floats:
-    """Return east and north, shape (n, 2), in the plane that touches the ellipsoid at each row's tile centre."""
-    lon, lat = np.radians(tile_centres_deg).T
-    offset = ecef_m - to_ecef(*tile_centres_deg.T)[tile]
-    east = np.column_stack((-np.sin(lon), np.cos(lon), np.zeros_like(lon)))[tile]
-    north = np.column_stack((-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)))[tile]
-    return np.column_stack((np.einsum("ij,ij->i", offset, east), np.einsum("ij,ij->i", offset, north)))
 
 
 def join_open(point: Ints, cluster: Ints, is_core: Flags, is_owned: Flags) -> tuple[Ints, Ints]:

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from geofleet.algorithms.clustering_kernels import radix_argsort
 from geofleet.algorithms.fusion import fuse, hash_members, information_weights, move_to_members, vote
 from geofleet.algorithms.tiling import cluster_tiles, join_open, quadkey_bounds
-from geofleet.tables.staging import read_rows
+from geofleet.tables.dealt import read_rows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,6 +24,14 @@ if TYPE_CHECKING:
     Columns = dict[str, NDArray[Any]]
     Flags = NDArray[np.bool_]
     Ints = NDArray[np.int64]
+
+
+_FUSED = frozenset(
+    {
+        *("lon", "lat", "var_m2", "class_confidence", "track_id", "t_first_us", "t_last_us"),
+        *("run_code", "pass_code", "pass_hash", "class_code"),
+    }
+)  # what a sign is made from
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +73,7 @@ def cluster_batch(task: TileTask) -> TileResult:
     )
     open_rows = {name: values[found.open_row] for name, values in rows.items()}
     open_rows |= {"cluster": found.open_cluster, "is_core": found.open_is_core}
-    closed = {name: values[found.closed_row] for name, values in rows.items()}
-    return TileResult(fuse_members(closed, found.closed_cluster), open_rows)
+    return TileResult(fuse_members(rows, found.closed_row, found.closed_cluster), open_rows)
 
 
 def fuse_open(parts: Sequence[Columns]) -> Columns:
@@ -84,18 +92,20 @@ def fuse_open(parts: Sequence[Columns]) -> Columns:
     point = np.empty(len(order), np.int64)
     point[order] = np.cumsum(is_new)
     row, cluster = join_open(point, rows["cluster"], rows["is_core"], rows["is_owned"])
-    return fuse_members({name: values[row] for name, values in rows.items()}, cluster)
+    return fuse_members(rows, row, cluster)
 
 
-def fuse_members(rows: Columns, cluster: Ints, *, is_weighted: bool = True, is_medoid: Flags | None = None) -> Columns:
+def fuse_members(
+    rows: Columns, member: Ints, cluster: Ints, *, is_weighted: bool = True, is_medoid: Flags | None = None
+) -> Columns:
     """Return one row a cluster; members are put in the order of their keys first.
 
     Parameters
     ----------
     rows
-        Members, (n,) a column.
-    cluster
-        (n,) cluster of each member.
+        Detections, one array a column.
+    member, cluster
+        (n,) the rows that are in clusters, and the cluster of each.
     is_weighted
         Whether centroids are weighted by information, or plain means.
     is_medoid
@@ -103,8 +113,9 @@ def fuse_members(rows: Columns, cluster: Ints, *, is_weighted: bool = True, is_m
     """
     if cluster.size == 0:
         return {}
-    order = np.lexsort((rows["track_id"], rows["pass_code"], cluster))
-    rows = {name: values[order] for name, values in rows.items()}
+    order = _key_order(rows["track_id"][member], rows["pass_code"][member], cluster)
+    taken = member[order]
+    rows = {name: values[taken] for name, values in rows.items() if name in _FUSED}
     first = np.append(np.flatnonzero(np.diff(cluster[order], prepend=-1)), cluster.size)
     lead = first[:-1]
     weight = information_weights(rows["var_m2"]) if is_weighted else np.ones(cluster.size)
@@ -127,6 +138,14 @@ def fuse_members(rows: Columns, cluster: Ints, *, is_weighted: bool = True, is_m
         "t_first_us": np.minimum.reduceat(rows["t_first_us"], lead),
         "t_last_us": np.maximum.reduceat(rows["t_last_us"], lead),
     }
+
+
+def _key_order(track_id: Ints, pass_code: Ints, cluster: Ints) -> Ints:
+    """Return the order by cluster, pass and track."""
+    if track_id.min() < 0:  # the radix sort takes no negative keys
+        return np.lexsort((track_id, pass_code, cluster))
+    order = radix_argsort(track_id, np.arange(track_id.size))
+    return radix_argsort(cluster, radix_argsort(pass_code, order))
 
 
 def concatenate(parts: Sequence[Columns]) -> Columns:

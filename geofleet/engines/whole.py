@@ -11,7 +11,7 @@ from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.algorithms.partitions import check_size, partition_groups
 from geofleet.engines.batches import concatenate, fuse_members
 from geofleet.errors import InputError
-from geofleet.tables.staging import read_rows
+from geofleet.tables.dealt import read_rows
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -65,9 +65,10 @@ def cluster_run(task: RunTask) -> Columns:
         max_clusters=task.max_clusters,
         min_cluster_size=task.min_cluster_size,
     )
-    member = found.labels >= 0
+    member = np.flatnonzero(found.labels >= 0)
     return fuse_members(
-        {name: values[member] for name, values in rows.items()},
+        rows,
+        member,
         found.labels[member],
         is_weighted=task.method == "hdbscan",
         is_medoid=found.is_medoid[member] if task.method == "kmedoids" else None,

@@ -24,13 +24,14 @@ from geofleet.engines.local import run_tasks
 from geofleet.engines.whole import RunTask, cluster_run
 from geofleet.errors import ConfigError
 from geofleet.tables.database import connect
-from geofleet.tables.fused import build_layer
-from geofleet.tables.manifest import write_manifest
+from geofleet.tables.dealt import batch_path
+from geofleet.tables.fused import Labels, layer_pieces
+from geofleet.tables.manifest import Hashing, write_manifest
 from geofleet.tables.opportunities import opportunities, read_passes
 from geofleet.tables.reference_counts import reference_counts
 from geofleet.tables.schemas import SIGNS
-from geofleet.tables.staging import Staged, batch_path, stage_detections
-from geofleet.tables.store import atomic_path, write_table
+from geofleet.tables.staging import Staged, stage_detections
+from geofleet.tables.store import atomic_path, write_pieces
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -129,6 +130,7 @@ def aggregate(
     label = _label(settings, k_from)
     driven = read_passes(passes) if passes else None
     counts = reference_counts(k_from, semantic=settings.semantic) if k_from else None
+    inputs = Hashing(path for path in (detections, passes, k_from) if path)
     out.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}.") as folder:
         staged = _stage(detections, Path(folder), settings, n_vehicles=n_vehicles, passes=passes, n_workers=n_workers)
@@ -145,15 +147,8 @@ def aggregate(
     if driven and clusters:
         clusters["n_opportunities"] = _opportunities(clusters, driven, sorted(fleet), n_vehicles)
     of_run = np.array([fleet[run_id] for run_id in sorted(fleet)], np.int64)
-    signs = build_layer(
-        clusters,
-        run_ids=sorted(fleet),
-        classes=staged.classes,
-        n_vehicles=of_run,
-        support=_support(clusters, of_run, settings),
-        method=label,
-    )
-    write_table(SIGNS, signs, out)
+    labels = Labels(tuple(sorted(fleet)), staged.classes, of_run, label)
+    n_signs = write_pieces(SIGNS, layer_pieces(clusters, _support(clusters, of_run, settings), labels), out)
     result = AggregateResult(
         out=out,
         rejected=_write_rejected(staged.rejected, out),
@@ -164,10 +159,10 @@ def aggregate(
         n_used=int(pc.sum(staged.tiles["n_points"]).as_py() or 0),
         n_tiles=staged.tiles.num_rows,
         n_clusters=len(clusters["lon"]) if clusters else 0,
-        n_signs=signs.num_rows,
+        n_signs=n_signs,
         notes=_notes(staged, n_vehicles),
     )
-    _write_manifest(result, [path for path in (detections, passes, k_from) if path], config)
+    _write_manifest(result, inputs, config)
     return result
 
 
@@ -318,12 +313,12 @@ def _notes(staged: Staged, n_vehicles: int | None) -> tuple[str, ...]:
     return few + (staged.bias.notes() if staged.bias else ())
 
 
-def _write_manifest(result: AggregateResult, inputs: list[Path], config: Config) -> None:
+def _write_manifest(result: AggregateResult, inputs: Hashing, config: Config) -> None:
     names = ("n_vehicles", "n_detections", "n_rejected", "n_used", "n_clusters", "n_signs")
     write_manifest(
         result.out,
         step="aggregate",
-        inputs=tuple(inputs),
+        inputs=inputs,
         config_digest=config.digest("aggregate"),
         settings=config.aggregate.model_dump(),
         counts={name: getattr(result, name) for name in names},

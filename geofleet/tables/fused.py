@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 
-from geofleet.algorithms.fusion import name_hashes
+from geofleet.algorithms.fusion import ID_SHIFT, name_hashes
 from geofleet.tables.schemas import SIGNS
 from geofleet.tables.staging import NEVER_BEGUN, NEVER_ENDED
 from geofleet.tables.store import build_table
 from geofleet.taxonomy.reader import load_taxonomy
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
     Columns = dict[str, NDArray[Any]]
     Ints = NDArray[np.int64]
 
+PIECE_ROWS = 60_000  # signs built and written at a time: tens of megabytes
 _NUMBERED_CLASS = re.compile(r"(?P<concept>[^:]+):(?P<value>-?\d+(\.\d+)?)(?P<unit>\D*)")
 _FUSED = (
     *("var_e_m2", "var_n_m2", "cov_en_m2", "class_confidence", "n_passes", "n_detections"),
@@ -29,41 +31,69 @@ _FUSED = (
 )  # the optional columns of the layer
 
 
-def build_layer(
-    clusters: Columns,
-    *,
-    run_ids: Sequence[str],
-    classes: Sequence[str],
-    n_vehicles: Ints,
-    support: NDArray[np.float64],
-    method: str,
-) -> pa.Table:
-    """Return the `signs` table of the clusters whose `n_passes` reach their support.
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """What the codes of clusters mean, and what is the same for all signs of a run.
+
+    Parameters
+    ----------
+    run_ids, classes
+        The meaning of `run_code` and `class_code`.
+    n_vehicles
+        (n_runs,) vehicles of every run.
+    method
+        The label of the layer.
+    """
+
+    run_ids: tuple[str, ...]
+    classes: tuple[str, ...]
+    n_vehicles: Ints
+    method: str
+
+
+def layer_pieces(clusters: Columns, support: NDArray[np.float64], labels: Labels) -> Iterator[pa.Table]:
+    """Yield the `signs` table of the clusters whose `n_passes` reach their support, some signs at a time.
+
+    There is at least one piece. Rows are in the order of their ids, over all pieces; how many share a piece depends on
+    nothing.
 
     Parameters
     ----------
     clusters
         As `engines.batches` makes them; with `n_opportunities`, the layer has that column too.
-    run_ids, classes
-        The meaning of `run_code` and `class_code`.
-    n_vehicles
-        (n_runs,) vehicles of every run.
     support
         (n,) passes that each cluster needs.
-    method
-        The label of the layer.
+    labels
+        What codes mean.
     """
     if not clusters:
-        return SIGNS.arrow(_FUSED).empty_table()
-    # in an order that comes from the clusters alone: it tells ids that collide apart
-    order = np.lexsort((clusters["lat"], clusters["lon"], clusters["class_code"], clusters["run_code"]))
-    order = order[(clusters["n_passes"] >= support)[order]]
-    kept = {name: values[order] for name, values in clusters.items()}
-    runs = pa.array(run_ids, pa.string()).take(pa.array(kept["run_code"]))
+        yield SIGNS.arrow(_FUSED).empty_table()
+        return
+    order = _by_name(clusters, np.flatnonzero(clusters["n_passes"] >= support))
+    names = name_hashes(clusters["hash"][order])
+    for begin in range(0, max(len(order), 1), PIECE_ROWS):
+        piece = slice(begin, begin + PIECE_ROWS)
+        yield _piece({name: values[order[piece]] for name, values in clusters.items()}, names[piece], labels)
+
+
+def _by_name(clusters: Columns, rows: Ints) -> Ints:
+    """Return rows in the order of their ids; those of equal ids in one that comes from the clusters alone."""
+    number = clusters["hash"][rows] >> ID_SHIFT
+    order = np.argsort(number, kind="stable")
+    number, rows = number[order], rows[order]
+    for begin in np.flatnonzero((np.diff(number) == 0) & (np.diff(number, prepend=number[:1] + 1)[:-1] != 0)).tolist():
+        tied = rows[begin : begin + int(np.searchsorted(number[begin:], number[begin], side="right"))]
+        keys = [clusters[name][tied] for name in ("lat", "lon", "class_code", "run_code")]
+        rows[begin : begin + tied.size] = tied[np.lexsort(keys)]
+    return rows
+
+
+def _piece(kept: Columns, names: NDArray[np.bytes_], labels: Labels) -> pa.Table:
+    runs = pa.array(labels.run_ids, pa.string()).take(pa.array(kept["run_code"]))
     columns: dict[str, Any] = {
-        "sign_id": name_hashes(kept["hash"].astype(np.uint64)),
+        "sign_id": _texts(names),
         "kind": "main",
-        **_class_columns(classes, kept["class_code"]),
+        **_class_columns(labels.classes, kept["class_code"]),
         "source": "geofleet",
         "source_ref": runs,
         "first_seen": _times(kept["t_first_us"], NEVER_BEGUN),
@@ -71,10 +101,20 @@ def build_layer(
         **_or_null(kept, ("var_e_m2", "var_n_m2", "cov_en_m2", "class_confidence")),
         **{name: pa.array(kept[name]) for name in ("n_passes", "n_detections", "n_opportunities") if name in kept},
         "run_id": runs,
-        "method": method,
-        "n_vehicles": n_vehicles[kept["run_code"]],
+        "method": labels.method,
+        "n_vehicles": labels.n_vehicles[kept["run_code"]],
     }
     return build_table(SIGNS, columns, geometry=(kept["lon"].astype(np.float64), kept["lat"].astype(np.float64)))
+
+
+def _texts(names: NDArray[np.bytes_]) -> pa.Array:
+    """Return fixed-width names, padded by zero bytes, as Arrow texts."""
+    width = names.dtype.itemsize
+    letters = names.view(np.uint8).reshape(len(names), width)
+    ends = np.append(0, np.cumsum((letters > 0).sum(axis=1))).astype(np.int32)
+    return pa.Array.from_buffers(
+        pa.string(), len(names), [None, pa.py_buffer(ends), pa.py_buffer(letters[letters > 0])]
+    )
 
 
 def _class_columns(classes: Sequence[str], class_code: Ints) -> dict[str, pa.Array]:

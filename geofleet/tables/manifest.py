@@ -9,6 +9,7 @@ import hashlib
 import json
 import platform
 from importlib import metadata
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from geofleet.tables.store import atomic_path
@@ -29,16 +30,20 @@ def write_manifest(
     out: Path,
     *,
     step: str,
-    inputs: Iterable[Path],
+    inputs: Iterable[Path] | Hashing,
     config_digest: str = "",
     settings: Mapping[str, Any] | None = None,
     counts: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write the manifest of an output file or folder atomically and return its path."""
+    """Write the manifest of an output file or folder atomically and return its path.
+
+    Inputs may have been hashed since before the step began.
+    """
     path = manifest_path(out)
+    hashing = inputs if isinstance(inputs, Hashing) else Hashing(inputs)
     content = {
         "step": step,
-        "inputs": [{"name": p.name, "sha256": hash_path(p)} for p in sorted(inputs)],
+        "inputs": [{"name": p.name, "sha256": digest} for p, digest in hashing.digests()],
         "output_sha256": hash_path(out),
         "config_digest": config_digest,
         "settings": dict(settings or {}),
@@ -48,6 +53,31 @@ def write_manifest(
     with atomic_path(path) as draft:
         draft.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n", encoding="utf-8")
     return path
+
+
+class Hashing:
+    """Hashes of input files or folders, taken on a thread beside the work; the errors of a step do not wait for it."""
+
+    def __init__(self, paths: Iterable[Path]) -> None:
+        self._paths = sorted(paths)
+        self._digests: list[str | OSError] = []
+        self._thread = Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        for path in self._paths:
+            try:
+                self._digests.append(hash_path(path))
+            except OSError as error:
+                self._digests.append(error)
+
+    def digests(self) -> list[tuple[Path, str]]:
+        """Return every path with its hash, sorted, once all are there."""
+        self._thread.join()
+        for digest in self._digests:
+            if isinstance(digest, OSError):
+                raise digest
+        return [(path, str(digest)) for path, digest in zip(self._paths, self._digests, strict=True)]
 
 
 def hash_path(path: Path) -> str:

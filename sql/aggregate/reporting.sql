@@ -1,16 +1,17 @@
--- why: what every pass reports: rows, usable rows and the range of their track ids. Vehicles and passes, the count of bad
---      rows and the search for repeated keys all start from here, so that the detections are not scanned for each
+-- why: what every pass reports: rows, usable rows and, where a bit string of $low to $high can hold them, different track
+--      ids. Vehicles and passes, the count of bad rows and the search for repeated keys all start from here, so that the
+--      detections are not scanned for each
 -- reads: @aggregate/judged
--- params: none
--- writes: run_id VARCHAR, vehicle_id VARCHAR, pass_id VARCHAR, n_rows BIGINT, n_usable BIGINT, track_low BIGINT,
---         track_high BIGINT
+-- params: $low (bigint, smallest track id), $high (bigint, largest track id), $is_narrow (boolean, ids fit bit strings)
+-- writes: run_id VARCHAR, vehicle_id VARCHAR, pass_id VARCHAR, n_rows BIGINT, n_usable BIGINT, n_track_ids BIGINT
 SELECT
     run_id,
     vehicle_id,
     pass_id,
     count(*) AS n_rows,
     count(*) FILTER (WHERE reason IS NULL) AS n_usable,
-    min(track_id) FILTER (WHERE reason IS NULL) AS track_low,
-    max(track_id) FILTER (WHERE reason IS NULL) AS track_high
+    bit_count(
+        bitstring_agg(CASE WHEN $is_narrow THEN track_id ELSE $low END, $low, $high) FILTER (WHERE reason IS NULL)
+    )::BIGINT AS n_track_ids
 FROM judged
 GROUP BY run_id, vehicle_id, pass_id

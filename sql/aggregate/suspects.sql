@@ -1,11 +1,11 @@
--- why: the passes that use a track id twice: fewer different ids, counted in a bit string, than usable rows
--- reads: @aggregate/judged
--- params: $low (bigint, smallest track id), $high (bigint, largest track id)
+-- why: the passes that may use a track id twice: fewer different ids than usable rows, or more than one vehicle
+-- reads: @aggregate/reporting
+-- params: none
 -- writes: run_id VARCHAR, pass_id VARCHAR
 SELECT
     run_id,
     pass_id
-FROM judged
-WHERE reason IS NULL
+FROM reporting
+WHERE n_usable > 0
 GROUP BY run_id, pass_id
-HAVING bit_count(bitstring_agg(track_id, $low, $high)) < count(*)
+HAVING count(*) > 1 OR sum(n_track_ids) < sum(n_usable)

@@ -1,6 +1,6 @@
 -- why: detections a cell of the finest grid; column and row are those of ST_QuadKey, as integers because a text a
 --      detection is slow
--- reads: @aggregate/points
+-- reads: @aggregate/chosen
 -- params: $fine_zoom (integer, zoom of the cells)
 -- writes: run_id VARCHAR, cell_x INTEGER, cell_y INTEGER, n_points BIGINT
 SELECT
@@ -10,5 +10,5 @@ SELECT
         (0.5 - ln((1 + sin(radians(lat))) / (1 - sin(radians(lat)))) / (4 * pi())) * (1 << $fine_zoom)
     )::INTEGER AS cell_y,
     count(*) AS n_points
-FROM points
+FROM chosen
 GROUP BY run_id, cell_x, cell_y

@@ -221,5 +221,7 @@ def test_votes_and_ties():
 
 
 def test_colliding_ids_are_told_apart():
-    hashes = np.array([0xABCDEF0123450000, 0x1, 0xABCDEF012345FFFF], np.uint64)
-    assert name_hashes(hashes) == ["fabcdef012345", "f000000000000", "fabcdef012345-2"]
+    hashes = np.array([0x1, 0xABCDEF0123450000, 0xABCDEF012345FFFF, 0xABCDEF0123460000], np.uint64)
+    names = [name.decode() for name in name_hashes(hashes).tolist()]
+    assert names == ["f000000000000", "fabcdef012345", "fabcdef012345-2", "fabcdef012346"]
+    assert name_hashes(hashes[:0]).size == 0

@@ -1,0 +1,106 @@
+"""Batches of detections on disk: rows as they come, dealt to the batches whose tiles read them, and read back."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from geofleet.algorithms.dealing import deal, index_readers, take_rows
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from geofleet.algorithms.dealing import Readers
+
+    Columns = dict[str, NDArray[Any]]
+    Ints = NDArray[np.int64]
+
+_HASHES_OF_PASSES = "pass_hash.npy"
+_FLOATS = ("lon", "lat", "var_m2", "class_confidence")
+_WHOLE = ("track_id", "t_first_us", "t_last_us")
+_CODES = ("pass_code", "class_code")
+_ROW = np.dtype(
+    [
+        *((name, np.float64) for name in _FLOATS),
+        *((name, np.int64) for name in _WHOLE),
+        *((name, np.int32) for name in (*_CODES, "tile_code")),
+        ("is_owned", np.bool_),
+    ],
+    align=True,
+)
+
+
+class Dealer:
+    """Deals blocks of rows (`sql/tiles/located`) to one file a batch below a folder.
+
+    Parameters
+    ----------
+    folder
+        Where the batches go, `batch_path(folder, number)`.
+    readers
+        The table `sql/tiles/readers`.
+    run_of_tile, run_of_pass
+        Number of the run of every tile and of every pass.
+    """
+
+    def __init__(self, folder: Path, readers: pa.Table, *, run_of_tile: Ints, run_of_pass: Ints) -> None:
+        columns = {name: readers[name].to_numpy() for name in readers.column_names if name != "run_id"}
+        box = np.column_stack([columns[name] for name in ("west", "east", "north", "south")])
+        batch = columns["batch"].astype(np.int64)
+        self._readers: Readers
+        self._readers, order = index_readers(
+            run_of_tile[columns["tile_code"]], columns["cell_x"], columns["cell_y"], batch, box
+        )
+        self._by_reader = columns["tile_code"][order], columns["is_owned"][order]
+        self._n_batches = int(batch.max(initial=-1)) + 1
+        self._run_of_pass, self._folder = run_of_pass, folder
+
+    def deal_all(self, blocks: pa.RecordBatchReader) -> None:
+        """Deal all blocks; the next one is made while one is dealt."""
+        with ThreadPoolExecutor(1) as pool:
+            dealing = None
+            for block in blocks:
+                if dealing:
+                    dealing.result()
+                dealing = pool.submit(self._deal, block)
+            if dealing:
+                dealing.result()
+
+    def _deal(self, block: pa.RecordBatch) -> None:
+        column = {
+            name: block.column(name).to_numpy(zero_copy_only=False) for name in block.schema.names if name != "run_id"
+        }
+        run = self._run_of_pass[column["pass_code"]]
+        row, reader, start = deal(run, column["x"], column["y"], self._readers, self._n_batches)
+        dealt = np.empty(row.size, _ROW)
+        kinds = (tuple(column[name] for name in names) for names in (_FLOATS, _WHOLE, _CODES))
+        take_rows(dealt, row, reader, self._by_reader, *kinds)
+        for number in np.flatnonzero(np.diff(start)).tolist():
+            with batch_path(self._folder, number).open("ab") as file:
+                dealt[start[number] : start[number + 1]].tofile(file)
+
+
+def batch_path(folder: Path, number: int) -> Path:
+    """Return the file of a batch."""
+    return folder / f"{number}.rows"
+
+
+def write_pass_hashes(folder: Path, hashes: NDArray[np.uint64]) -> None:
+    """Keep the hash of every pass beside the batches."""
+    np.save(folder / _HASHES_OF_PASSES, hashes)
+
+
+def read_rows(path: Path) -> Columns:
+    """Read a batch: one array a column of `sql/tiles/members`, and the hash of each row's pass."""
+    rows = np.fromfile(path, _ROW)
+    columns: Columns = {
+        name: rows[name].astype(np.int64 if kind.kind == "i" else kind)
+        for name, kind in ((name, _ROW[name]) for name in _ROW.names or ())
+    }
+    hashes = np.load(path.with_name(_HASHES_OF_PASSES), mmap_mode="r")
+    return columns | {"pass_hash": hashes[columns["pass_code"]]}
