@@ -8,6 +8,7 @@ from __future__ import annotations
 
 BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#999999"
+LIGHT_GREY = "#D0D0D0"
 
 # Where something is drawn beside others of its kind, e.g. a method of several.
 SERIES = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY_BLUE, BLACK)

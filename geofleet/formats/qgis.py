@@ -18,6 +18,7 @@ from geofleet.formats.palette import (
     GOSPA_M_CLASSES,
     GREEN,
     GREY,
+    LIGHT_GREY,
     ORANGE,
     SKY_BLUE,
     VERMILLION,
@@ -27,10 +28,12 @@ from geofleet.formats.palette import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-_DOCUMENT = Template(
-    """<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
+_DOCUMENT = """<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
 <qgis version="3.22.0" styleCategories="Symbology|MapTips">
- <renderer-v2 type="RuleRenderer" symbollevels="0" forceraster="0" enableorderby="0">
+{style}</qgis>
+"""
+_STYLE = Template(
+    """ <renderer-v2 type="RuleRenderer" symbollevels="0" forceraster="0" enableorderby="0">
   <rules key="root">
 $rules
   </rules>
@@ -40,7 +43,6 @@ $symbols
  </renderer-v2>
  <previewExpression>$title</previewExpression>
  <mapTip>$tip</mapTip>
-</qgis>
 """
 )
 _RULE = Template("   <rule key=$key symbol=$key label=$label filter=$filter/>")
@@ -77,6 +79,10 @@ class Style:
 
     def qml(self) -> str:
         """Return the style as a QML document."""
+        return _DOCUMENT.format(style=self.elements())
+
+    def elements(self) -> str:
+        """Return renderer, title and map tip as elements of a QML document or of a layer of a project."""
         rules, symbols = [], []
         for number, rule in enumerate(self.rules):
             key = quoteattr(str(number))
@@ -94,7 +100,7 @@ class Style:
             )
         tip = "&lt;br&gt;".join(f"{name}: [% &quot;{name}&quot; %]" for name in self.tip)
         title = f"&quot;{self.title}&quot;"
-        return _DOCUMENT.substitute(rules="\n".join(rules), symbols="\n".join(symbols), title=title, tip=tip)
+        return _STYLE.substitute(rules="\n".join(rules), symbols="\n".join(symbols), title=title, tip=tip)
 
 
 def _marker(label: str, expression: str, shape: str, *, fill: str, line: str, size_mm: float) -> Rule:
@@ -107,6 +113,12 @@ def _area(label: str, expression: str, *, fill: str, line: str, pattern: str = "
     """Return a rule that draws polygons."""
     options = {"color": fill, "style": pattern, "outline_color": line, "outline_width": str(width_mm)}
     return Rule(label, expression, "SimpleFill", options | {"outline_style": "solid"})
+
+
+def _line(label: str, *, colour: str, width_mm: float, pattern: str = "solid") -> Rule:
+    """Return a rule that draws lines."""
+    options = {"line_color": rgb(colour), "line_style": pattern, "line_width": str(width_mm)}
+    return Rule(label, "", "SimpleLine", options | {"capstyle": "round", "joinstyle": "round"})
 
 
 def _tiles() -> tuple[Rule, ...]:
@@ -132,7 +144,7 @@ STYLES: Mapping[str, Style] = MappingProxyType(
             ("sign_class", "semi_major_m", "semi_minor_m", "orientation_deg"),
         ),
         "match_lines": Style(
-            (Rule("match", "", "SimpleLine", {"line_color": rgb(ORANGE), "line_width": "0.5", "line_style": "solid"}),),
+            (_line("match", colour=ORANGE, width_mm=0.5),),
             "fused_id",
             ("ref_class", "distance_m"),
         ),
@@ -163,6 +175,15 @@ STYLES: Mapping[str, Style] = MappingProxyType(
             ),
             "outcome",
             ("outcome", "ref_class", "fused_class", "distance_m"),
+        ),
+    }
+)
+# Of what a result lies on.
+GROUND_STYLES: Mapping[str, Style] = MappingProxyType(
+    {
+        "drives": Style((_line("drive", colour=BLACK, width_mm=0.4, pattern="dash"),), "drive_id", ("drive_id",)),
+        "roads": Style(
+            (_line("road", colour=LIGHT_GREY, width_mm=1.0),), "road_id", ("road_id", "kind", "speed_limit_kmh")
         ),
     }
 )

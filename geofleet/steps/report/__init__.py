@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from geofleet.steps.report.contents import read_contents
 from geofleet.steps.report.figures import write_figures
 from geofleet.steps.report.page import render_page
+from geofleet.steps.report.qgis import PROJECT, write_qgis
 from geofleet.steps.report.scene import lay_out
 from geofleet.steps.report.study import read_study
 from geofleet.tables.manifest import write_manifest
@@ -39,14 +40,14 @@ def report(
     method: str | None = None,
     n_vehicles: int | None = None,
 ) -> ReportResult:
-    """Write page and figures of a run.
+    """Write page and figures of a run, and a QGIS project of it.
 
     Parameters
     ----------
     run_dir
         Folder of a run: an `evaluation`, and beside it lanes, drives and a simulation where there are any.
     out
-        Folder to write.
+        Folder to write; the QGIS project goes into the folder `qgis` beside it, which leads to the run's own layers.
     run_id, method, n_vehicles
         The map to draw, when several were scored; by default the largest fleet, and of its maps the one with the
         median GOSPA_M.
@@ -64,5 +65,10 @@ def report(
         draft.mkdir()
         (draft / PAGE).write_text(render_page(contents, scene, study), encoding="utf-8")
         names = [PAGE, *write_figures(contents, scene, study, draft)]
+    project = out.parent / "qgis"
+    made = write_qgis(contents, project)
+    write_manifest(project, step="report", inputs=contents.inputs)
     write_manifest(out, step="report", inputs=[*contents.inputs, *study.inputs])
-    return ReportResult(out, tuple(out / name for name in names))
+    files = (out / PAGE, project / PROJECT)
+    rest = (*(out / name for name in names[1:]), *(project / name for name in made[1:]))
+    return ReportResult(out, (*files, *rest))

@@ -12,6 +12,7 @@ from geofleet.formats.palette import (
     BLUE,
     GREEN,
     GREY,
+    LIGHT_GREY,
     ORANGE,
     SERIES,
     SKY_BLUE,
@@ -102,7 +103,7 @@ def _map(contents: Contents, scene: Scene) -> Figure:
     figure = _figure(contents, 9.0, float(np.clip(8.0 * height / width + 0.9, 4.0, 10.0)))
     axes = figure.add_subplot()
     _draw_tiles(axes, scene)
-    _draw_lines(axes, scene.roads, "", color="#D0D0D0", linewidths=2.2, zorder=1.5)
+    _draw_lines(axes, scene.roads, "", color=LIGHT_GREY, linewidths=2.2, zorder=1.5)
     drive = "drive (derived)" if contents.is_drive_derived else "drive"
     _draw_lines(axes, scene.drives, drive, color="#333333", linewidths=1.2, linestyles="--", zorder=2)
     _draw_lines(axes, list(scene.lines), "", color=ORANGE, linewidths=1.5, zorder=5.5)

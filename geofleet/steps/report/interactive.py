@@ -12,6 +12,7 @@ from geofleet.formats.palette import (
     BLUE,
     GREEN,
     GREY,
+    LIGHT_GREY,
     ORANGE,
     SERIES,
     SKY_BLUE,
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from geofleet.steps.report.study import Study
 
 FONT = "system-ui, sans-serif"
-ROAD, INK, FAINT = "#D9D9D9", "#333333", "#E8E8E8"
+INK, FAINT = "#333333", "#E8E8E8"
 _TIP = """
 <div style="font: 13px/1.45 system-ui, sans-serif; margin: 2px 0 6px">
 <b style="color:{colour}">{title}</b> @sign_class<br>
@@ -273,7 +274,7 @@ def _draw_ground(plot: Figure, scene: Scene) -> None:
         legend_label="tiles by GOSPA_M",
     )
     if scene.roads:
-        _lines(plot, scene.roads, "roads", line_color=ROAD, line_width=3.5, line_cap="round", line_join="round")
+        _lines(plot, scene.roads, "roads", line_color=LIGHT_GREY, line_width=3.5, line_cap="round", line_join="round")
     if scene.drives:
         _lines(plot, scene.drives, "drive", line_color=INK, line_width=1.6, line_dash="dashed")
 
