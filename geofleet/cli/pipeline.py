@@ -163,7 +163,12 @@ def evaluate(
 @app.command()
 def report(
     run_dir: Annotated[Path, typer.Argument(help="Folder of a run: an evaluation, and lanes and drives beside it.")],
-    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; RUN_DIR/report by default.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", help="Folder to write; RUN_DIR/report by default. The QGIS project goes into qgis/ beside it."
+        ),
+    ] = None,
     run_id: Annotated[str | None, typer.Option("--run-id", help="Draw a map of this run.")] = None,
     method: Annotated[str | None, typer.Option(help="Draw a map of this method, e.g. dbscan-first.")] = None,
     vehicles: Annotated[int | None, typer.Option("--vehicles", help="Draw a map of this fleet size.")] = None,
@@ -204,5 +209,5 @@ def demo(
         return
     typer.echo(f"\n{result.caption}\n")
     print_scores(result.totals)
-    typer.echo("\nOpen the page in a browser, and drag the GeoPackage into QGIS (every layer opens styled):")
+    typer.echo("\nOpen the page in a browser and the project in QGIS (every layer is styled):")
     print_files(result.files)

@@ -10,11 +10,10 @@ import pyarrow.compute as pc
 
 from geofleet.config import load_config
 from geofleet.errors import InputError
-from geofleet.formats.results import GEOPACKAGE
 from geofleet.steps.aggregate import aggregate
 from geofleet.steps.evaluate import evaluate
 from geofleet.steps.ingest import ingest_drive, ingest_lanes, ingest_signs
-from geofleet.steps.report import PAGE, report
+from geofleet.steps.report import PAGE, PROJECT, report
 from geofleet.steps.simulate import simulate
 from geofleet.tables.schemas import RUNS, SCORES
 from geofleet.tables.store import read_table
@@ -88,5 +87,5 @@ def demo_result(out: Path) -> DemoResult:
         f"{runs[0]['n_vehicles']} simulated vehicles (scenario {runs[0]['scenario']}, tracker {runs[0]['tracker']}, "
         f"upload {runs[0]['upload']}) past real signs of central Helsinki, on a drive derived from the road graph."
     )
-    files = (page, out / "evaluation" / GEOPACKAGE)
+    files = (page, out / "qgis" / PROJECT)
     return DemoResult(caption, tuple(totals), files)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pyarrow.compute as pc
 import pytest
+from matplotlib.image import imread
 
 from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.config import load_config
@@ -102,3 +104,10 @@ def test_results_do_not_need_the_truth(demo, tmp_path):
     finally:
         hidden.rename(truth)
     assert hash_path(tmp_path / "fused.parquet") == hash_path(demo / "fused" / "fused.parquet")
+
+
+def test_the_picture_of_the_readme_is_the_demos_map(demo, repo):
+    """A font may be drawn a little differently elsewhere; another map would differ in far more than a hundredth."""
+    shown, made = (imread(path)[..., :3] for path in (repo / "docs" / "demo.png", demo / "report" / "map.png"))
+    assert shown.shape == made.shape, "cp data/processed/report/map.png docs/demo.png"
+    assert np.abs(shown - made).mean() < 0.01, "cp data/processed/report/map.png docs/demo.png"

@@ -21,6 +21,8 @@ from geofleet.tables.store import atomic_path
 if TYPE_CHECKING:
     from pathlib import Path
 
+__all__ = ["PAGE", "PROJECT", "ReportResult", "report"]
+
 PAGE = "report.html"
 
 
