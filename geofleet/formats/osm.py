@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from geofleet.formats.osm_rows import SignRows, clean_nodes
-from geofleet.formats.osm_scan import detect, read_roads, refuse_lanelet2, scan, sign_nodes
+from geofleet.formats.osm_road_scan import read_roads
+from geofleet.formats.osm_rows import EDGE, SignRows
+from geofleet.formats.osm_scan import detect, refuse_lanelet2, scan, sign_nodes
 from geofleet.formats.reading import LayerRead, LayerStream
 from geofleet.tables.schemas import LANES
 from geofleet.tables.store import build_table
@@ -16,14 +17,12 @@ if TYPE_CHECKING:
 __all__ = ["FORMAT", "detect", "read_lanes", "read_signs"]
 
 FORMAT = "osm"
-EDGE = "way nodes beyond the edge of the file"
 
 
 def read_signs(path: Path, *, roads: bool = True) -> LayerStream:
     """Read the signs of an OpenStreetMap file a piece at a time.
 
-    What is held are 20 bytes a node with signs, the different tags of such nodes and, with `roads`, the drivable ways
-    and facing and road of each sign.
+    Nodes with signs wait on disk; held are the different tags of such nodes and, with `roads`, the drivable ways.
 
     Parameters
     ----------
@@ -39,15 +38,10 @@ def read_signs(path: Path, *, roads: bool = True) -> LayerStream:
         The file is missing, empty, damaged or not OpenStreetMap's.
     """
     nodes, ways = scan(path, lambda pbf: (sign_nodes(pbf), read_roads(pbf) if roads else None))
-    if not len(nodes.node_id):
+    if not nodes.spool.n_nodes:
         refuse_lanelet2(path)
-    nodes, skipped = clean_nodes(nodes)
-    rows = SignRows.of(nodes, source=path.name)
-    found = {"unknown codes": rows.n_unknown, "facings in the tags": rows.n_facings}
-    if ways is not None:
-        rows, told = rows.with_roads(ways)
-        found |= told | {EDGE: ways.n_missing_nodes}
-    return LayerStream(rows.pieces, FORMAT, skipped, found)
+    rows = SignRows(nodes, source=path.name, roads=ways)
+    return LayerStream(rows.pieces, FORMAT, rows.skipped, rows.found)
 
 
 def read_lanes(path: Path) -> LayerRead:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     Ints = NDArray[np.int64]
 
-__all__ = ["Block", "DenseNodes", "Strings", "UnusualPbfError", "deltas", "read_blocks", "varints"]
+__all__ = ["Block", "DenseNodes", "Strings", "UnusualPbfError", "deltas", "read_blocks", "varints", "varints_of"]
 
 _MAX_HEADER_BYTES = 64 * 1024
 _MAX_BLOB_BYTES = 32 * 1024 * 1024
@@ -227,6 +227,17 @@ def varints(packed: bytes) -> Ints:
         rows = np.flatnonzero(n_more >= place)
         value[rows] |= low[starts[rows] + place].astype(kind) << kind(7 * place)
     return value.astype(np.uint64).view(np.int64)
+
+
+def varints_of(parts: list[bytes]) -> tuple[Ints, Ints]:
+    """Decode many packed sequences at once; return their numbers and where each begins, with the total last."""
+    joined = b"".join(parts)
+    numbers = varints(joined)
+    ends = np.cumsum([0, *map(len, parts)])
+    is_last = np.frombuffer(joined, np.uint8) < 0x80  # noqa: PLR2004 - the top bit says that more bytes follow
+    if not is_last[ends[1:][np.diff(ends) > 0] - 1].all():
+        raise DamagedPbfError("a number that does not end")
+    return numbers, np.concatenate(([0], np.cumsum(is_last)))[ends]
 
 
 def deltas(packed: bytes) -> Ints:

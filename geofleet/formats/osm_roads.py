@@ -9,15 +9,16 @@ import numpy as np
 import shapely
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
 
 MAX_ROAD_DISTANCE_M = 50.0
-_CELL_DEG = (0.1, 0.05)  # longitude, latitude: one ENU frame each, at most 11 km across
+_MAX_SEGMENT_M, _STEP_M = 100_000.0, 60.0
+_ROWS_A_DEGREE, _COLUMNS_A_DEGREE, _COLUMN_BITS, _MAX_ROWS = 1000.0, 900.0, 20, 3
+_A_M, _E2 = 6_378_137.0, 6.694_379_990_141_33e-3  # WGS 84
+_HALF_TURN_DEG = 180.0
 
 # ISO 3166-1 codes of countries that drive on the left
 _LEFT_HAND = (
@@ -92,52 +93,93 @@ class NearestRoad:
     is_right: NDArray[np.bool_]
 
 
-def nearest_road(roads: Roads, lon: Floats, lat: Floats) -> NearestRoad:
-    """Find the nearest way of each point, in metres of a local ENU frame a cell of `_CELL_DEG`.
+class RoadIndex:
+    """Drivable ways, made ready to be asked for the nearest one of any points.
 
-    Of equally near segments the first of the file counts.
+    Every segment is marked in cells of some 110 m, at most `_STEP_M` apart; the marks, sorted by cell, are the index.
     """
-    from geofleet.algorithms.geodesy import EnuFrame  # noqa: PLC0415  (brings pyproj, which `--no-roads` spares)
 
-    run = np.full(len(lon), -1, np.int64)
-    bearing = np.full(len(lon), np.nan)
-    is_right = np.zeros(len(lon), bool)
-    first, run_of_segment = roads.segments()
-    for points, near in _cells(roads, first, lon, lat):
-        frame = EnuFrame.around(lon[points], lat[points])
-        xy = frame.to_enu(lon[points], lat[points])
-        start = frame.to_enu(roads.lon[first[near]], roads.lat[first[near]])
-        end = frame.to_enu(roads.lon[first[near] + 1], roads.lat[first[near] + 1])
-        tree = shapely.STRtree(shapely.linestrings(np.stack((start, end), axis=1)))
-        query, hit = tree.query_nearest(shapely.points(xy), max_distance=MAX_ROAD_DISTANCE_M)
-        order = np.lexsort((hit, query))
-        query, one = np.unique(query[order], return_index=True)
-        hit = hit[order][one]
-        along, beside = end[hit] - start[hit], xy[query] - start[hit]
-        at = points[query]
-        run[at] = run_of_segment[near[hit]]
-        bearing[at] = np.degrees(np.arctan2(along[:, 0], along[:, 1])) % 360.0
-        is_right[at] = along[:, 0] * beside[:, 1] - along[:, 1] * beside[:, 0] < 0
-    return NearestRoad(run, bearing, is_right)
+    def __init__(self, roads: Roads) -> None:
+        self.roads = roads
+        first, run = roads.segments()
+        self._start, self._end = (np.column_stack((roads.lon[at], roads.lat[at])) for at in (first, first + 1))
+        self._run = run.astype(np.int32)
+        step_deg = self._end - self._start
+        step_deg[:, 0] = _turn(step_deg[:, 0])
+        east, north = _metres_per_degree(self._start[:, 1])
+        length_m = np.hypot(east * step_deg[:, 0], north * step_deg[:, 1])
+        # What is longer is a damaged file, not a road
+        n_marks = np.where(length_m < _MAX_SEGMENT_M, np.ceil(length_m / _STEP_M).clip(1), 0).astype(np.int64)
+        segment = np.repeat(np.arange(len(first), dtype=np.int32), n_marks)
+        within = np.arange(len(segment)) - np.repeat(np.cumsum(n_marks) - n_marks, n_marks)
+        share = ((within + 0.5) / n_marks[segment])[:, np.newaxis]
+        marks = self._start[segment] + share * step_deg[segment]
+        row = np.floor(marks[:, 1] * _ROWS_A_DEGREE).astype(np.int64)
+        cell = _cell(row, marks[:, 0])
+        order = np.argsort(cell, kind="stable")
+        self._cell, self._segment = cell[order], segment[order]
+
+    def nearest(self, lon: Floats, lat: Floats) -> NearestRoad:
+        """Find the nearest way of each point, in metres of the plane that touches the ellipsoid there.
+
+        Of equally near segments the first of the file counts.
+        """
+        query, segment = self._candidates(lon, lat)
+        east, north = _metres_per_degree(lat[query])
+        scale = np.column_stack((east, north))
+        start, end = (side[segment] - np.column_stack((lon, lat))[query] for side in (self._start, self._end))
+        start[:, 0], end[:, 0] = _turn(start[:, 0]), _turn(end[:, 0])
+        start, end = start * scale, end * scale
+        along = end - start
+        square = np.maximum((along**2).sum(axis=1), np.finfo(float).tiny)
+        share = (-(start * along).sum(axis=1) / square)[:, np.newaxis].clip(0.0, 1.0)
+        foot = np.where(share < 1.0, start + share * along, end)
+        distance = np.hypot(foot[:, 0], foot[:, 1])
+        near = np.flatnonzero(distance <= MAX_ROAD_DISTANCE_M)
+        near = near[np.lexsort((segment[near], distance[near], query[near]))]
+        at, one = np.unique(query[near], return_index=True)
+        best = near[one]
+        run, bearing, is_right = np.full(len(lon), -1, np.int64), np.full(len(lon), np.nan), np.zeros(len(lon), bool)
+        run[at] = self._run[segment[best]]
+        bearing[at] = np.degrees(np.arctan2(along[best, 0], along[best, 1])) % 360.0
+        # The point is the origin: it lies to the right where the way turns about it to the left.
+        is_right[at] = along[best, 0] * -start[best, 1] + along[best, 1] * start[best, 0] < 0
+        return NearestRoad(run, bearing, is_right)
+
+    def _candidates(self, lon: Floats, lat: Floats) -> tuple[Ints, Ints]:
+        """Return pairs of a point and a segment marked near it."""
+        east, north = _metres_per_degree(lat)
+        reach_m = np.hypot(MAX_ROAD_DISTANCE_M, _STEP_M / 2.0) + 1.0
+        low, high = (np.floor((lat + side * reach_m / north) * _ROWS_A_DEGREE).astype(np.int64) for side in (-1, 1))
+        queries, marks = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+        for row in (low + step for step in range(_MAX_ROWS)):
+            west, beside = (_cell(row, lon + side * reach_m / east) for side in (-1, 1))
+            for cell, is_new in ((west, row <= high), (beside, (row <= high) & (beside != west))):
+                begin = np.searchsorted(self._cell, cell)
+                size = np.where(is_new, np.searchsorted(self._cell, cell, side="right") - begin, 0)
+                queries.append(np.repeat(np.arange(len(lon)), size))
+                marks.append(np.arange(size.sum()) - np.repeat(np.cumsum(size) - size - begin, size))
+        return np.concatenate(queries), self._segment[np.concatenate(marks)].astype(np.int64)
 
 
-def _cells(roads: Roads, first: Ints, lon: Floats, lat: Floats) -> Iterator[tuple[Ints, Ints]]:
-    """Yield the points of each occupied cell with the segments whose box comes near to theirs."""
-    if not len(first):
-        return
-    ends = np.stack((first, first + 1))
-    x, y = roads.lon[ends], roads.lat[ends]
-    tree = shapely.STRtree(shapely.box(x.min(axis=0), y.min(axis=0), x.max(axis=0), y.max(axis=0)))
-    cell = np.stack((np.floor(lon / _CELL_DEG[0]), np.floor(lat / _CELL_DEG[1])), axis=1)
-    _, label = np.unique(cell, axis=0, return_inverse=True)
-    order = np.argsort(label, kind="stable")
-    for points in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
-        west, south, east, north = lon[points].min(), lat[points].min(), lon[points].max(), lat[points].max()
-        tall = MAX_ROAD_DISTANCE_M / 110_000.0
-        wide = tall / max(np.cos(np.radians(np.abs(lat[points]).max())), 0.01)
-        near = np.sort(tree.query(shapely.box(west - wide, south - tall, east + wide, north + tall)))
-        if len(near):
-            yield points.astype(np.int64), near.astype(np.int64)
+def _cell(row: Ints, lon: Floats) -> Ints:
+    """Return the number of a cell: rows are equally high, and cells of a row about as wide."""
+    narrow = np.cos(np.radians((row + 0.5) / _ROWS_A_DEGREE)).clip(0.01)
+    column = np.floor((lon + _HALF_TURN_DEG) % (2.0 * _HALF_TURN_DEG) * narrow * _COLUMNS_A_DEGREE).astype(np.int64)
+    return np.asarray((row << _COLUMN_BITS) + column, np.int64)
+
+
+def _metres_per_degree(lat: Floats) -> tuple[Floats, Floats]:
+    """Return the length of a degree to the east and to the north on WGS 84, from its radii of curvature."""
+    phi = np.radians(lat)
+    flat = 1.0 - _E2 * np.sin(phi) ** 2
+    prime_vertical = _A_M / np.sqrt(flat)
+    return np.radians(prime_vertical * np.cos(phi)).clip(1.0), np.radians(prime_vertical * (1.0 - _E2) / flat)
+
+
+def _turn(difference_deg: Floats) -> Floats:
+    """Return differences of longitude the short way round."""
+    return (difference_deg + _HALF_TURN_DEG) % (2.0 * _HALF_TURN_DEG) - _HALF_TURN_DEG
 
 
 def facing_of(roads: Roads, near: NearestRoad, side: NDArray[np.object_], is_left_hand: NDArray[np.bool_]) -> Floats:

@@ -1,4 +1,4 @@
-"""What is looked for in an OpenStreetMap file: nodes that carry signs, and drivable ways with their nodes.
+"""What is looked for in an OpenStreetMap file: nodes that carry signs.
 
 Files are PBF, or are made into one first, by libosmium, in a temporary folder: then one reader serves all.
 """
@@ -10,21 +10,18 @@ import tempfile
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from geofleet.errors import InputError
 from geofleet.formats import osm_json
-from geofleet.formats.osm_pbf import Block, DenseNodes, Strings, UnusualPbfError, deltas, read_blocks, varints
-from geofleet.formats.osm_roads import Roads
+from geofleet.formats.osm_pbf import Block, DenseNodes, Strings, UnusualPbfError, read_blocks
+from geofleet.formats.osm_spool import NODE, NodeSpool
 from geofleet.formats.osm_tags import (
     KEY_STARTS,
     POINT_HIGHWAYS,
-    is_drivable,
     is_sign_key,
-    oneway_of,
-    speed_kmh,
     tells_of_signs,
 )
 from geofleet.formats.reading import BZIP2, GZIP, read_head
@@ -41,9 +38,7 @@ _PBF_MARK = b"OSMHeader"
 _MARK_WITHIN = 1024
 _LANELET = re.compile(rb"""v=["']lanelet["']""")
 _CHUNK, _OVERLAP = 1 << 20, 64
-_E7 = 1e7
 _TAG_BYTES = 16  # two numbers
-_MAX_E7 = (1_800_000_000, 900_000_000)
 _HIGHWAY = b"\n\x07highway"
 # What a block with signs has in its string table: a key, or a word of `highway` with its length before it.
 _WORDS = tuple(b"\n%c" % len(word) + word.encode() for word in POINT_HIGHWAYS)
@@ -52,45 +47,18 @@ _MARKS = (b"traffic_sign", *_WORDS)
 
 @dataclass(frozen=True, slots=True)
 class SignNodes:
-    """Nodes that carry signs, in the order of the file.
+    """Nodes that carry signs.
 
     Parameters
     ----------
-    node_id
-        Shape (n,).
-    lon_e7, lat_e7
-        Position in 1e-7 degrees, as the file has it, shape (n,).
-    tagset
-        Index into `tagsets`, shape (n,).
+    spool
+        Id, position and number of the tags of each.
     tagsets
         The different tags that such nodes have, those that tell of signs only.
     """
 
-    node_id: Ints
-    lon_e7: NDArray[np.int32]
-    lat_e7: NDArray[np.int32]
-    tagset: NDArray[np.int32]
+    spool: NodeSpool
     tagsets: list[dict[str, str]]
-
-    @property
-    def is_valid(self) -> NDArray[np.bool_]:
-        """Which positions lie on Earth."""
-        lon, lat = np.abs(self.lon_e7.astype(np.int64)), np.abs(self.lat_e7.astype(np.int64))
-        return np.asarray((lon <= _MAX_E7[0]) & (lat <= _MAX_E7[1]), bool)
-
-    @property
-    def lon(self) -> NDArray[np.float64]:
-        """Longitude in degrees, shape (n,)."""
-        return self.lon_e7 / _E7
-
-    @property
-    def lat(self) -> NDArray[np.float64]:
-        """Latitude in degrees, shape (n,)."""
-        return self.lat_e7 / _E7
-
-    def take(self, rows: NDArray[Any]) -> SignNodes:
-        """Return some of the nodes."""
-        return SignNodes(self.node_id[rows], self.lon_e7[rows], self.lat_e7[rows], self.tagset[rows], self.tagsets)
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,18 +178,18 @@ def sign_nodes(pbf: Path) -> SignNodes:
     """
     known: dict[bytes, int] = {}
     tagsets: dict[bytes, int] = {}
-    columns: list[tuple[Ints, NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]] = []
+    spool = NodeSpool()
     has_nodes = False
     for groups in read_blocks(pbf, _signs_in, nodes_only=True):
         has_nodes |= groups is not None
         for found in groups or ():
-            tagset = _numbered(found, known, tagsets)
-            columns.append((found.node_id, _int32(found.lon_e7), _int32(found.lat_e7), tagset))
+            nodes = np.empty(len(found.node_id), NODE)
+            nodes["node_id"], nodes["tagset"] = found.node_id, _numbered(found, known, tagsets)
+            nodes["lon_e7"], nodes["lat_e7"] = _int32(found.lon_e7), _int32(found.lat_e7)
+            spool.append(nodes)
     if not has_nodes:
         raise InputError("the file holds no nodes.", where=str(pbf), todo="Check that it is the extract you mean.")
-    empty = (np.zeros(0, np.int64), *(np.zeros(0, np.int32) for _ in range(3)))
-    node_id, lon32, lat32, tagset = (np.concatenate(column) for column in zip(empty, *columns, strict=True))
-    return SignNodes(node_id, lon32, lat32, tagset, [_tags(packed, list(known)) for packed in tagsets])
+    return SignNodes(spool, [_tags(packed, list(known)) for packed in tagsets])
 
 
 def _numbered(found: _Found, known: dict[bytes, int], tagsets: dict[bytes, int]) -> NDArray[np.int32]:
@@ -300,102 +268,3 @@ def _sign_tags(
     chosen = np.flatnonzero(carries)
     counts = np.bincount(owner[kept], minlength=len(carries))[chosen]
     return chosen, counts, np.column_stack((key[kept], value[kept]))
-
-
-def read_roads(pbf: Path) -> Roads:
-    """Read the drivable ways: one pass for the ways, one for the nodes that they refer to.
-
-    Raises
-    ------
-    InputError
-        The file is damaged.
-    """
-    ways = [way for found in read_blocks(pbf, _ways_in) for way in found]
-    refs = np.concatenate([np.zeros(0, np.int64), *(way.refs for way in ways)])
-    way_of = np.repeat(np.arange(len(ways)), [len(way.refs) for way in ways])
-    wanted = np.unique(refs)
-    place = np.full((len(wanted), 2), np.iinfo(np.int64).max)
-    for found in read_blocks(pbf, lambda block: _nodes_in(block, wanted), nodes_only=True):
-        for index, lon, lat in found:
-            place[index, 0], place[index, 1] = lon, lat
-    there = (np.abs(place) <= _MAX_E7).all(axis=1)
-    index = np.searchsorted(wanted, refs)
-    is_there = there[index]
-    way_of, index = way_of[is_there], index[is_there]
-    kept, first, sizes = _runs(np.flatnonzero(is_there), way_of)
-    run_way = way_of[first]
-    points = place[index[kept]] / _E7
-    new = np.flatnonzero(np.diff(run_way, prepend=-1))
-    return Roads(
-        way_id=np.array([ways[way].way_id for way in run_way], np.int64),
-        part=np.arange(len(run_way)) - np.repeat(new, np.diff(new, append=len(run_way))),
-        oneway=np.array([ways[way].oneway for way in run_way], np.int8),
-        kind=np.array([ways[way].kind for way in run_way], object),
-        speed_limit_kmh=np.array([ways[way].speed_limit_kmh for way in run_way], np.float64),
-        start=np.concatenate(([0], np.cumsum(sizes))),
-        lon=points[:, 0],
-        lat=points[:, 1],
-        n_missing_nodes=int((~is_there).sum()),
-    )
-
-
-def _runs(position: Ints, way_of: Ints) -> tuple[NDArray[np.bool_], Ints, Ints]:
-    """Find runs of two and more points that follow each other within a way.
-
-    Returns which points belong to one, the first point of each and its size.
-    """
-    breaks = (np.diff(position, prepend=-2) != 1) | (np.diff(way_of, prepend=-1) != 0)
-    first = np.flatnonzero(breaks)
-    sizes = np.diff(first, append=len(position))
-    is_long = sizes > 1
-    return np.repeat(is_long, sizes), first[is_long], sizes[is_long]
-
-
-@dataclass(frozen=True, slots=True)
-class _Way:
-    way_id: int
-    refs: Ints
-    kind: str
-    oneway: int
-    speed_limit_kmh: float
-
-
-def _ways_in(block: Block) -> list[_Way]:
-    """Return the drivable ways of a block."""
-    if not block.holds_string(_HIGHWAY):
-        return []
-    strings = block.strings
-    highway = next(strings.numbers(_HIGHWAY, whole=True), None)
-    if highway is None:
-        return []
-    mark = _encoded(highway)
-    found = []
-    for way_id, keys, values, refs in block.ways(lambda packed: mark in packed):
-        pairs = zip(varints(keys).tolist(), varints(values).tolist(), strict=True)
-        tags = {strings[key].decode(errors="replace"): strings[value].decode(errors="replace") for key, value in pairs}
-        if is_drivable(tags):
-            speed = speed_kmh(tags.get("maxspeed"))
-            found.append(
-                _Way(way_id, deltas(refs), tags["highway"], oneway_of(tags), np.nan if speed is None else speed)
-            )
-    return found
-
-
-def _nodes_in(block: Block, wanted: Ints) -> list[tuple[Ints, Ints, Ints]]:
-    """Return index among the wanted ids, longitude and latitude of the nodes of a block that are wanted."""
-    found = []
-    for nodes in block.dense_nodes(tagged=False):
-        index = np.searchsorted(wanted, nodes.node_id)
-        hit = np.flatnonzero(wanted[np.minimum(index, len(wanted) - 1)] == nodes.node_id) if len(wanted) else index[:0]
-        found.append((index[hit], nodes.lon_e7[hit], nodes.lat_e7[hit]))
-    return found
-
-
-def _encoded(number: int) -> bytes:
-    """Return a number as PBF packs it."""
-    packed = bytearray()
-    while number > 0x7F:  # noqa: PLR2004 - seven bits a byte
-        packed.append(number & 0x7F | 0x80)
-        number >>= 7
-    packed.append(number)
-    return bytes(packed)

@@ -46,6 +46,8 @@ CAR_ROADS = frozenset(
     }
 )
 _CLOSED = {"area": {"yes"}, "access": {"private", "no"}, "motor_vehicle": {"no"}, "motorcar": {"no"}}
+# What `is_drivable`, `oneway_of` and `speed_kmh` look at
+ROAD_KEYS = frozenset({"highway", "oneway", "junction", "maxspeed", *_CLOSED})
 
 
 @dataclass(frozen=True, slots=True)

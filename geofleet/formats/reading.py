@@ -77,7 +77,7 @@ class LayerStream:
     pieces
         Gives tables in the schema asked for, each sorted by key and all of it before the next; at least one.
     file_format, skipped, found, datum
-        As `LayerRead`.
+        As `LayerRead`; the counts are whole once all pieces have been taken.
     """
 
     pieces: Callable[[], Iterator[pa.Table]]

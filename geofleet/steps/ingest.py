@@ -223,11 +223,11 @@ def _ingest(
     for done, (path, _, reader) in enumerate(plan):
         if progress:
             progress(done, len(plan))
-        layer = reader(path)
+        layers_read.append(reader(path))
+    n_rows = write_pieces(schema, _counted(_pieces(schema, layers_read, skipped), kind, kinds), Path(out))
+    for layer in layers_read:
         skipped.update(layer.skipped)
         found.update(layer.found)
-        layers_read.append(layer)
-    n_rows = write_pieces(schema, _counted(_pieces(schema, layers_read, skipped), kind, kinds), Path(out))
     if progress:
         progress(len(plan), len(plan))
     by_kind = {name or "unknown": n for name, n in kinds.most_common()}

@@ -45,7 +45,7 @@ def _patterns() -> dict[str, list[tuple[str, str]]]:
     found: dict[str, list[tuple[str, str]]] = {}
     for rule in load_taxonomy().rules:
         if rule.country or rule.scheme == "osm":
-            pattern = rule.pattern.pattern.replace(NUMBER, "{n}")
+            pattern = rule.text.replace(NUMBER, "{n}")
             found.setdefault(rule.concept.name, []).append((rule.country, pattern))
     return found
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import re
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -70,14 +70,19 @@ class Classified:
     known: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Rule:
     concept: Concept
-    pattern: re.Pattern[str]
+    text: str
     value_rule: str
     unit: str
     scheme: str
     country: str
+
+    @cached_property
+    def pattern(self) -> re.Pattern[str]:
+        """Compiled when a code is first held against it: most countries are in no file at hand."""
+        return re.compile(self.text, re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -140,7 +145,7 @@ def load_taxonomy() -> Taxonomy:
     rules = []
     for row in csv.DictReader(text.splitlines()):
         concept = concepts.setdefault(row["concept"], Concept(row["concept"], row["group"], row["kind"], row["unit"]))
-        pattern = re.compile(row["code_pattern"].replace("{n}", NUMBER, 1).replace("{n}", r"\d+"), re.IGNORECASE)
+        pattern = row["code_pattern"].replace("{n}", NUMBER, 1).replace("{n}", r"\d+")
         rules.append(_Rule(concept, pattern, row["value_rule"], row["unit"], row["scheme"], row["country"]))
     return Taxonomy(concepts, tuple(rules))
 
@@ -148,8 +153,9 @@ def load_taxonomy() -> Taxonomy:
 @lru_cache(maxsize=65536)
 def _meaning(code: str, country: str, scheme: str) -> Meaning:
     text, land = _normalised(code.strip(), country.upper(), scheme)
+    candidates = tuple(dict.fromkeys((text, _without_bracket(text))))
     for rule in _rules_for(land, scheme):
-        for candidate in dict.fromkeys((text, _without_bracket(text))):
+        for candidate in candidates:
             match = rule.pattern.fullmatch(candidate)
             if match:
                 return _understood(rule, match, text)

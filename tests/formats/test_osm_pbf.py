@@ -14,7 +14,8 @@ from osmium.osm.mutable import Node, Way
 from geofleet.errors import InputError
 from geofleet.formats.osm import read_lanes, read_signs
 from geofleet.formats.osm_pbf import Strings, UnusualPbfError, deltas, read_blocks, varints
-from geofleet.formats.osm_scan import read_roads, sign_nodes
+from geofleet.formats.osm_road_scan import read_roads
+from geofleet.formats.osm_scan import sign_nodes
 from geofleet.formats.osm_tags import POINT_HIGHWAYS, is_drivable, is_sign_key
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
@@ -95,13 +96,16 @@ def test_strings_are_found_wherever_their_bytes_repeat(texts):
         )
 
 
+def all_of(nodes):
+    """Return all nodes of a spool, in the order of the file."""
+    return np.concatenate(list(nodes.spool.chunks()))
+
+
 @pytest.mark.parametrize("how", ["zlib", "raw"])
 def test_a_block_by_hand(tmp_path, how):
     nodes = sign_nodes(pbf(tmp_path / "a.pbf", block(STRINGS, SIGN), how=how))
-    assert nodes.node_id.tolist() == [5, -3]
-    assert nodes.lon.tolist() == [10.0, 0.0]
-    assert nodes.lat.tolist() == [50.0, 0.0]
-    assert [nodes.tagsets[n] for n in nodes.tagset] == [{"traffic_sign": "DE:206"}, {"highway": "stop"}]
+    found = [(n, x, y, nodes.tagsets[s]) for n, x, y, s in all_of(nodes).tolist()]
+    assert found == [(5, 100_000_000, 500_000_000, {"traffic_sign": "DE:206"}), (-3, 0, 0, {"highway": "stop"})]
 
 
 @pytest.mark.parametrize(
@@ -111,8 +115,7 @@ def test_granularity_and_offsets_are_libosmium_s(tmp_path, numbers):
     group = dense([(n, 1234567 * n, -7654321 * n, [1, 2]) for n in range(1, 12)])
     path = pbf(tmp_path / "a.osm.pbf", block(STRINGS, group, **numbers))
     expected = [(node.id, node.location.x, node.location.y) for node in osmium.FileProcessor(path, NODE)]
-    nodes = sign_nodes(path)
-    assert list(zip(nodes.node_id.tolist(), nodes.lon_e7.tolist(), nodes.lat_e7.tolist(), strict=True)) == expected
+    assert [row[:3] for row in all_of(sign_nodes(path)).tolist()] == expected
 
 
 def way_group(*ways):
@@ -136,7 +139,7 @@ def test_ways_may_come_before_their_nodes_and_in_one_block_with_them(tmp_path):
         roads = read_roads(path)
         assert roads.way_id.tolist() == [7]
         assert roads.lat.tolist() == [50.0, -50.0]
-        assert len(sign_nodes(path).node_id) == 2
+        assert len(all_of(sign_nodes(path))) == 2
 
 
 def plain_nodes(*nodes):
@@ -232,9 +235,9 @@ def test_sign_nodes_are_those_that_osmium_finds(real):
                     {k: v for k, v in tags.items() if is_sign_key(k)},
                 )
         nodes = sign_nodes(path)
-        found = zip(nodes.node_id.tolist(), nodes.lon_e7.tolist(), nodes.lat_e7.tolist(), nodes.tagset, strict=True)
         assert {
-            n: (x, y, {k: v for k, v in nodes.tagsets[s].items() if is_sign_key(k)}) for n, x, y, s in found
+            n: (x, y, {k: v for k, v in nodes.tagsets[s].items() if is_sign_key(k)})
+            for n, x, y, s in all_of(nodes).tolist()
         } == expected
 
 
@@ -269,7 +272,7 @@ def test_many_blocks_stay_in_order_and_share_their_tags(tmp_path):
             writer.add_node(Node(id=n, location=(n * 1e-4, 1.0), tags={"traffic_sign": "DE:206"} if n % 3 else {}))
         writer.add_way(Way(id=1, nodes=[1, 40_000], tags={"highway": "primary"}))
     nodes = sign_nodes(path)
-    assert nodes.node_id.tolist() == [n for n in range(1, 40_001) if n % 3]
+    assert all_of(nodes)["node_id"].tolist() == [n for n in range(1, 40_001) if n % 3]
     assert nodes.tagsets == [{"traffic_sign": "DE:206"}]
     layer = read_signs(path, roads=False)
     ids = [row for piece in layer.pieces() for row in piece["sign_id"].to_pylist()]

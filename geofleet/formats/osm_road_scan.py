@@ -1,0 +1,166 @@
+"""Drivable ways of an OpenStreetMap file and the nodes that they refer to, out of PBF, a block at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from geofleet.formats.osm_pbf import Block, read_blocks, varints_of
+from geofleet.formats.osm_roads import Roads
+from geofleet.formats.osm_tags import CAR_ROADS, ROAD_KEYS, is_drivable, oneway_of, speed_kmh
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from geofleet.formats.osm_pbf import Strings
+
+    Ints = NDArray[np.int64]
+
+_E7 = 1e7
+_MAX_E7 = (1_800_000_000, 900_000_000)
+_NOWHERE = np.iinfo(np.int32).max
+_HIGHWAY = b"\n\x07highway"
+
+
+def read_roads(pbf: Path) -> Roads:
+    """Read the drivable ways: one pass for the ways, one for the nodes that they refer to.
+
+    Raises
+    ------
+    InputError
+        The file is damaged.
+    """
+    ways = _Ways.joined([found for found in read_blocks(pbf, _ways_in) if found])
+    way_of = np.repeat(np.arange(len(ways.way_id)), ways.n_refs)
+    wanted = np.unique(ways.refs)
+    index = np.searchsorted(wanted, ways.refs).astype(np.int32)
+    place = np.full((len(wanted), 2), _NOWHERE, np.int32)
+    for found in read_blocks(pbf, lambda block: _nodes_in(block, wanted), nodes_only=True):
+        for rows, lon, lat in found:
+            place[rows, 0], place[rows, 1] = lon, lat
+    there = np.asarray((np.abs(place) <= _MAX_E7).all(axis=1), bool)
+    is_there = there[index]
+    kept, first, sizes = _runs(np.flatnonzero(is_there), way_of[is_there])
+    run_way = way_of[is_there][first]
+    points = place[index[is_there][kept]] / _E7
+    new = np.flatnonzero(np.diff(run_way, prepend=-1))
+    return Roads(
+        way_id=ways.way_id[run_way],
+        part=np.arange(len(run_way)) - np.repeat(new, np.diff(new, append=len(run_way))),
+        oneway=ways.oneway[run_way],
+        kind=ways.kind[run_way],
+        speed_limit_kmh=ways.speed_limit_kmh[run_way],
+        start=np.concatenate(([0], np.cumsum(sizes))),
+        lon=points[:, 0],
+        lat=points[:, 1],
+        n_missing_nodes=int((~is_there).sum()),
+    )
+
+
+def _runs(position: Ints, way_of: Ints) -> tuple[NDArray[np.bool_], Ints, Ints]:
+    """Find runs of two and more points that follow each other within a way.
+
+    Returns which points belong to one, the first point of each and its size.
+    """
+    breaks = (np.diff(position, prepend=-2) != 1) | (np.diff(way_of, prepend=-1) != 0)
+    first = np.flatnonzero(breaks)
+    sizes = np.diff(first, append=len(position))
+    is_long = sizes > 1
+    return np.repeat(is_long, sizes), first[is_long], sizes[is_long]
+
+
+@dataclass(frozen=True, slots=True)
+class _Ways:
+    """Drivable ways, shape (n,), and the ids of their nodes, one way after the other."""
+
+    way_id: Ints
+    n_refs: Ints
+    refs: Ints
+    kind: NDArray[np.object_]
+    oneway: NDArray[np.int8]
+    speed_limit_kmh: NDArray[np.float64]
+
+    @classmethod
+    def joined(cls, parts: list[_Ways]) -> _Ways:
+        kinds = (np.int64, np.int64, np.int64, object, np.int8, np.float64)
+        columns = [[getattr(part, name) for part in parts] for name in cls.__slots__]
+        return cls(*(np.concatenate([np.zeros(0, k), *c]) for k, c in zip(kinds, columns, strict=True)))
+
+
+def _ways_in(block: Block) -> _Ways | None:
+    """Return the drivable ways of a block."""
+    if not block.holds_string(_HIGHWAY):
+        return None
+    strings = block.strings
+    highway = next(strings.numbers(_HIGHWAY, whole=True), None)
+    if highway is None:
+        return None
+    mark = _encoded(highway)
+    ways = list(block.ways(lambda packed: mark in packed))
+    keys, start = varints_of([way[1] for way in ways])
+    values, values_start = varints_of([way[2] for way in ways])
+    if not np.array_equal(start, values_start):
+        raise ValueError("keys and values of a way differ in number")
+    drivable = {
+        int(n): tags
+        for n in np.unique(np.searchsorted(start, _roads_at(strings, highway, keys, values), "right") - 1)
+        if is_drivable(tags := _tags(strings, keys[start[n] : start[n + 1]], values[start[n] : start[n + 1]]))
+    }
+    coded, begins = varints_of([ways[n][3] for n in drivable])
+    speeds = [speed_kmh(tags.get("maxspeed")) for tags in drivable.values()]
+    return _Ways(
+        way_id=np.array([ways[n][0] for n in drivable], np.int64),
+        n_refs=np.diff(begins),
+        refs=_summed(coded, begins),
+        kind=np.array([tags["highway"] for tags in drivable.values()], object),
+        oneway=np.array([oneway_of(tags) for tags in drivable.values()], np.int8),
+        speed_limit_kmh=np.array([np.nan if speed is None else speed for speed in speeds], np.float64),
+    )
+
+
+def _roads_at(strings: Strings, highway: int, keys: Ints, values: Ints) -> Ints:
+    """Return the places of tags that make a way a road for cars."""
+    is_road = np.zeros(len(strings), bool)
+    for word in CAR_ROADS:
+        is_road[list(strings.numbers(b"\n%c" % len(word) + word.encode(), whole=True))] = True
+    at = np.flatnonzero(keys == highway)
+    return at[is_road[values[at]]]
+
+
+def _tags(strings: Strings, keys: Ints, values: Ints) -> dict[str, str]:
+    """Return the tags that matter to a car."""
+    texts = ((strings[key].decode(errors="replace"), value) for key, value in zip(keys.tolist(), values, strict=True))
+    return {key: strings[value].decode(errors="replace") for key, value in texts if key in ROAD_KEYS}
+
+
+def _summed(coded: Ints, start: Ints) -> Ints:
+    """Return zigzag-coded differences as the numbers themselves, each way's beginning from zero."""
+    bits = coded.view(np.uint64)
+    half = (bits >> np.uint64(1)).view(np.int64)
+    total = np.concatenate(([0], np.cumsum(np.where(bits & np.uint64(1), ~half, half))))
+    return np.asarray(total[1:] - np.repeat(total[start[:-1]], np.diff(start)), np.int64)
+
+
+def _nodes_in(block: Block, wanted: Ints) -> list[tuple[Ints, Ints, Ints]]:
+    """Return index among the wanted ids, longitude and latitude of the nodes of a block that are wanted."""
+    found = []
+    for nodes in block.dense_nodes(tagged=False):
+        index = np.searchsorted(wanted, nodes.node_id)
+        hit = np.flatnonzero(wanted[np.minimum(index, len(wanted) - 1)] == nodes.node_id) if len(wanted) else index[:0]
+        lon, lat = (np.clip(side[hit], -_NOWHERE, _NOWHERE) for side in (nodes.lon_e7, nodes.lat_e7))
+        found.append((index[hit], lon, lat))
+    return found
+
+
+def _encoded(number: int) -> bytes:
+    """Return a number as PBF packs it."""
+    packed = bytearray()
+    while number > 0x7F:  # noqa: PLR2004 - seven bits a byte
+        packed.append(number & 0x7F | 0x80)
+        number >>= 7
+    packed.append(number)
+    return bytes(packed)
