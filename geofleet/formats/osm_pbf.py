@@ -43,6 +43,7 @@ _NANO_PER_E7 = 100
 _PEEK_BYTES = 32
 _VARINT, _BYTES = 0, 2
 _FIXED_BYTES = {1: 8, 5: 4}
+_WAY_FIELDS = ((1, 0), (2, b""), (3, b""), (8, b""))  # id, keys, values, refs
 
 _T = TypeVar("_T")
 Span = tuple[int, int]
@@ -183,14 +184,25 @@ class Block:
                         yield way
 
     def _way(self, span: Span) -> tuple[int, bytes, bytes, bytes]:
-        way_id = 0
-        packed = {2: b"", 3: b"", 8: b""}
-        for number, value in _fields(self.data, span):
-            if isinstance(value, tuple):
-                packed[number] = self.data[slice(*value)]
-            elif number == 1:
-                way_id = _signed(value)
-        return way_id, packed[2], packed[3], packed[8]
+        # The same as `_fields` in one loop: ways are what a file has most of, and each has five fields.
+        data, (at, end) = self.data, span
+        found: dict[int, int | bytes] = {}
+        while at < end:
+            key, at = (data[at], at + 1) if data[at] < 0x80 else _varint(data, at)  # noqa: PLR2004 - one byte
+            size, at = (data[at], at + 1) if data[at] < 0x80 else _varint(data, at)  # noqa: PLR2004 - as above
+            if key & 7 == _VARINT:
+                found[key >> 3] = size
+            elif key & 7 == _BYTES and at + size <= end:
+                found[key >> 3] = data[at : at + size]
+                at += size
+            else:
+                raise DamagedPbfError("a field beyond its end")
+        way_id, keys, values, refs = (found.get(number, missing) for number, missing in _WAY_FIELDS)
+        if not (isinstance(way_id, int) and isinstance(keys, bytes)):
+            raise DamagedPbfError("a way without its fields")
+        if not (isinstance(values, bytes) and isinstance(refs, bytes)):
+            raise DamagedPbfError("a way without its fields")
+        return _signed(way_id), keys, values, refs
 
     def _dense(self, span: Span, numbers: dict[int, int], *, tagged: bool) -> DenseNodes:
         packed = {1: b"", 8: b"", 9: b"", 10: b""}

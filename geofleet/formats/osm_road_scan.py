@@ -12,6 +12,7 @@ from geofleet.formats.osm_roads import Roads
 from geofleet.formats.osm_tags import CAR_ROADS, ROAD_KEYS, is_drivable, oneway_of, speed_kmh
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -105,11 +106,8 @@ def _ways_in(block: Block) -> _Ways | None:
     values, values_start = varints_of([way[2] for way in ways])
     if not np.array_equal(start, values_start):
         raise ValueError("keys and values of a way differ in number")
-    drivable = {
-        int(n): tags
-        for n in np.unique(np.searchsorted(start, _roads_at(strings, highway, keys, values), "right") - 1)
-        if is_drivable(tags := _tags(strings, keys[start[n] : start[n + 1]], values[start[n] : start[n + 1]]))
-    }
+    roads = np.unique(np.searchsorted(start, _roads_at(strings, highway, keys, values), "right") - 1)
+    drivable = {n: tags for n, tags in _tags(strings, keys, values, start, roads) if is_drivable(tags)}
     coded, begins = varints_of([ways[n][3] for n in drivable])
     speeds = [speed_kmh(tags.get("maxspeed")) for tags in drivable.values()]
     return _Ways(
@@ -131,10 +129,16 @@ def _roads_at(strings: Strings, highway: int, keys: Ints, values: Ints) -> Ints:
     return at[is_road[values[at]]]
 
 
-def _tags(strings: Strings, keys: Ints, values: Ints) -> dict[str, str]:
-    """Return the tags that matter to a car."""
-    texts = ((strings[key].decode(errors="replace"), value) for key, value in zip(keys.tolist(), values, strict=True))
-    return {key: strings[value].decode(errors="replace") for key, value in texts if key in ROAD_KEYS}
+def _tags(strings: Strings, keys: Ints, values: Ints, start: Ints, ways: Ints) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield some of the ways with those of their tags that matter to a car."""
+    names = {
+        number: word
+        for word in ROAD_KEYS
+        for number in strings.numbers(b"\n%c" % len(word) + word.encode(), whole=True)
+    }
+    for way, first, last in zip(ways.tolist(), start[ways].tolist(), start[ways + 1].tolist(), strict=True):
+        pairs = zip(keys[first:last].tolist(), values[first:last].tolist(), strict=True)
+        yield way, {names[key]: strings[value].decode(errors="replace") for key, value in pairs if key in names}
 
 
 def _summed(coded: Ints, start: Ints) -> Ints:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 MAX_ROAD_DISTANCE_M = 50.0
 _MAX_SEGMENT_M, _STEP_M = 100_000.0, 60.0
 _ROWS_A_DEGREE, _COLUMNS_A_DEGREE, _COLUMN_BITS, _MAX_ROWS = 1000.0, 900.0, 20, 3
+_POINTS_AT_ONCE = 1 << 11
 _A_M, _E2 = 6_378_137.0, 6.694_379_990_141_33e-3  # WGS 84
 _HALF_TURN_DEG = 180.0
 
@@ -124,9 +125,13 @@ class RoadIndex:
 
         Of equally near segments the first of the file counts.
         """
+        parts = [slice(first, first + _POINTS_AT_ONCE) for first in range(0, max(len(lon), 1), _POINTS_AT_ONCE)]
+        found = [self._nearest(lon[part], lat[part]) for part in parts]
+        return NearestRoad(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+    def _nearest(self, lon: Floats, lat: Floats) -> tuple[Ints, Floats, NDArray[np.bool_]]:
         query, segment = self._candidates(lon, lat)
-        east, north = _metres_per_degree(lat[query])
-        scale = np.column_stack((east, north))
+        scale = np.column_stack(_metres_per_degree(lat))[query]
         start, end = (side[segment] - np.column_stack((lon, lat))[query] for side in (self._start, self._end))
         start[:, 0], end[:, 0] = _turn(start[:, 0]), _turn(end[:, 0])
         start, end = start * scale, end * scale
@@ -144,7 +149,7 @@ class RoadIndex:
         bearing[at] = np.degrees(np.arctan2(along[best, 0], along[best, 1])) % 360.0
         # The point is the origin: it lies to the right where the way turns about it to the left.
         is_right[at] = along[best, 0] * -start[best, 1] + along[best, 1] * start[best, 0] < 0
-        return NearestRoad(run, bearing, is_right)
+        return run, bearing, is_right
 
     def _candidates(self, lon: Floats, lat: Floats) -> tuple[Ints, Ints]:
         """Return pairs of a point and a segment marked near it."""
