@@ -7,6 +7,10 @@ the heading itself.
 
 **Kind.** Signals that are dynamic, or of a type that ASAM lists as a light, are lights; those without a type are
 `other`; plates and markings are what the taxonomy says; all the rest are main signs.
+
+**Boards** (OpenDRIVE 1.8). Each `<sign>` of a `<staticBoard>` is a signal of its own, at its v and z on the board; of
+what it leaves out the board decides. The board itself stays a row: a variable or mixed one as a main sign, a static one
+as `other`. **Semantics** say what a signal means whose code says nothing.
 """
 
 from __future__ import annotations
@@ -19,13 +23,12 @@ from typing import TYPE_CHECKING
 
 from geofleet.errors import InputError
 from geofleet.formats.countries import country_code
-from geofleet.formats.xml import number
+from geofleet.formats.xml import Element, number
 from geofleet.taxonomy import load_taxonomy
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from geofleet.formats.xml import Element
     from geofleet.taxonomy import Meaning
 
 NO_ID = "signals without an id"
@@ -34,10 +37,13 @@ BEYOND = "signals beyond the ends of their road"
 NO_ROAD = "signals placed on a road that the file does not hold"
 NO_NUMBER = "values that are no number"
 TWICE = "ids of signals given more than once"
+ON_BOARDS = "signs on boards"
 
 _NONE = frozenset({"", "-1", "none", "null"})
 _YES = frozenset({"yes", "true", "1"})
 _STVO_PLATE = re.compile(r"10\d\d")
+_DEPENDENCIES = ("dependency", "signalDependency")
+_OF_BOARDS = ("orientation", "hOffset", "country", "countryRevision")  # and of the signs on them, unless they say so
 _AGAINST = {"+": 0.0, "-": math.pi}
 # To the units that codes are written with
 _UNITS = {
@@ -112,7 +118,17 @@ class SignalReader:
     found: Counter[str] = field(default_factory=Counter)
 
     def add(self, element: Element, road_id: str) -> None:
-        """Read one `<signal>` of a road."""
+        """Read one `<signal>` of a road, and the signs on it when it is a board."""
+        self._add(element, road_id)
+        for board in element.findall("staticBoard"):
+            for sign in board.findall("sign"):
+                self.found[ON_BOARDS] += 1
+                try:
+                    self._add(_on_board(sign, element), road_id)
+                except InputError:
+                    self.skipped[NO_PLACE] += 1
+
+    def _add(self, element: Element, road_id: str) -> None:
         signal_id = element.get("id", "").strip()
         if not signal_id:
             self.skipped[NO_ID] += 1
@@ -129,14 +145,17 @@ class SignalReader:
         if not code:
             raw_code = element.get("name", "").strip() or "untyped"
             meaning = load_taxonomy().meaning(raw_code, scheme="opendrive")
-        is_light = element.get("dynamic", "").strip().lower() in _YES or meaning.kind == "light"
+        stated = None if meaning.known else _semantics(element)
+        meaning = stated or meaning
+        is_dynamic = element.get("dynamic", "").strip().lower() in _YES and not code.endswith("Board")
+        is_light = is_dynamic or meaning.kind == "light"
         references = [(r.get("elementType", ""), r.get("elementId", "").strip()) for r in element.findall("reference")]
-        depends = [d.get("id", "").strip() for d in element.findall("dependency")]
+        depends = [d.get("id", "").strip() for name in _DEPENDENCIES for d in element.findall(name)]
         self.signals.append(
             Signal(
                 signal_id,
                 road_id,
-                "light" if is_light else _kind(code, country, meaning),
+                "light" if is_light else meaning.kind if stated else _kind(code, country, meaning),
                 raw_code,
                 country,
                 element.get("countryRevision", "").strip() or None,
@@ -226,6 +245,53 @@ def _places(element: Element, road_id: str) -> tuple[Place, Place | None]:
     )
 
 
+def _on_board(sign: Element, board: Element) -> Element:
+    """Return a sign of a board as a signal that stands by itself: what it leaves out is the board's."""
+    own = {
+        name[:1].lower() + name[1:]: value for name, value in sign.attrib.items()
+    }  # the standard writes Country, too
+    given = {name: board.get(name, "") for name in _OF_BOARDS if name in board.attrib}
+    if given.get("country", "").strip().lower() == "opendrive":
+        del given["country"]  # the catalogue of the board's type, not a country
+    side, up = number(sign, "v", 0.0), number(sign, "z", 0.0)
+    against = _AGAINST.get(board.get("orientation", "").strip(), 0.0)
+    found = _moved(board, ("s", "t", "zOffset"), against + number(board, "hOffset", 0.0), side, up)
+    placed = {name: found.get(name, "") for name in ("s", "t", "zOffset")}
+    found.attrib.clear()
+    found.attrib.update(given | {"dynamic": "no"} | own | placed)
+    inertial, road = board.find("positionInertial"), board.find("positionRoad")
+    if inertial is not None:
+        found.append(_moved(inertial, ("x", "y", "z"), number(inertial, "hdg", 0.0), side, up))
+    elif road is not None:
+        found.append(_moved(road, ("s", "t", "zOffset"), against + number(road, "hOffset", 0.0), side, up))
+    found.extend(sign)
+    return found
+
+
+def _moved(element: Element, names: tuple[str, str, str], heading: float, side_m: float, up_m: float) -> Element:
+    """Return an element, without what is in it, whose place is moved to the left of a heading, and up."""
+    along, beside, height = names
+    moved = Element(element.tag, dict(element.attrib))
+    moved.line = element.line
+    if side_m or up_m:
+        moved.set(along, repr(number(element, along) - side_m * math.sin(heading)))
+        moved.set(beside, repr(number(element, beside) + side_m * math.cos(heading)))
+        moved.set(height, repr(number(element, height, 0.0) + up_m))
+    return moved
+
+
+def _semantics(element: Element) -> Meaning | None:
+    """Return what the `<semantics>` of a signal say, the first that has a concept; None without any."""
+    for semantics in element.findall("semantics"):
+        for said in semantics:
+            value = said.get("value", "").strip()
+            bracket = f"[{value} {said.get('unit', '').strip()}]" if value else ""
+            meaning = load_taxonomy().meaning(f"{said.tag}:{said.get('type', '').strip()}{bracket}", scheme="opendrive")
+            if meaning.known:
+                return meaning
+    return None
+
+
 def _understood(code: str, value: float | None, unit: str, country: str | None) -> tuple[Meaning, str]:
     """Return the meaning of a code and the code with the value that it does not hold itself.
 
@@ -252,7 +318,7 @@ def _kind(code: str, country: str | None, meaning: Meaning) -> str:
     """
     if not code:
         return "other"
-    if meaning.kind in {"plate", "marking"}:
+    if meaning.kind in {"plate", "marking"} or code == "staticBoard":
         return meaning.kind
     if country is None and _STVO_PLATE.fullmatch(code.partition("-")[0]):
         return "plate"

@@ -599,3 +599,77 @@ def test_reference_lines_agree_with_pyxodr(shared_data):
                 line = shapely.linestrings(np.column_stack((x, y)))
                 points = shapely.points(theirs[road.road_id].reference_line[:, :2])
                 assert shapely.distance(line, points).max() < 0.001
+
+
+@pytest.fixture
+def read(path):
+    """Read a document of one road that runs east from the origin, with some signals."""
+    return lambda *signals: read_signs(path(document(road(signals="".join(signals)))), origin=ORIGIN)
+
+
+BOARD = """<staticBoard>
+<sign id="535" Country="DE" type="274" subtype="60" v="-0.5" z="1.5" value="60" unit="km/h">
+<signalDependency id="536"/></sign>
+<sign id="536" Country="DE" type="1010" subtype="51" v="-0.75" z="0.9"/>
+<sign id="537" country="DE" type="276" subtype="-1" v="0.75" z="1.5"/>
+</staticBoard>"""
+
+
+@pytest.mark.parametrize("orientation", ["+", "-"])
+def test_signs_on_a_board_stand_where_the_board_has_them(read, orientation):
+    board = signal("534", BOARD, type="staticBoard", country="OpenDRIVE", zOffset=5, orientation=orientation)
+    layer = read(board)
+    table = layer.table
+    rows = {row["sign_id"]: row for row in table.to_pylist()}
+    place = dict(zip(table["sign_id"].to_pylist(), metres(table), strict=True))
+    assert {name: row["sign_class"] for name, row in rows.items()} == {
+        "534": "sign_board",
+        "535": "speed_limit:60",
+        "536": "plate_vehicle",
+        "537": "no_overtaking",
+    }
+    assert {name: row["kind"] for name, row in rows.items()} == {
+        "534": "other",
+        "535": "main",
+        "536": "plate",
+        "537": "main",
+    }
+    assert rows["536"]["parent_id"] == "535"
+    assert rows["535"]["height_m"] == pytest.approx(6.5)
+    assert [row["facing_deg"] for row in rows.values()] == pytest.approx([rows["534"]["facing_deg"]] * 4, abs=1e-5)
+    # The road runs east; left of who looks along it is north
+    left = 1.0 if orientation == "+" else -1.0
+    assert place["535"] == pytest.approx({"x": 100.0, "y": -5.0 - 0.5 * left}, abs=1e-3)
+    assert place["537"] == pytest.approx({"x": 100.0, "y": -5.0 + 0.75 * left}, abs=1e-3)
+    assert layer.found["signs on boards"] == 3
+
+
+def test_a_board_may_have_a_place_of_its_own_and_signs_without_an_offset(read):
+    inside = '<positionInertial x="50" y="20" z="3" hdg="0"/>' + BOARD
+    table = read(signal("534", inside, type="multiBoard", dynamic="yes")).table
+    place = dict(zip(table["sign_id"].to_pylist(), metres(table), strict=True))
+    assert place["534"] == pytest.approx({"x": 50.0, "y": 20.0}, abs=1e-3)
+    assert place["537"] == pytest.approx({"x": 50.0, "y": 20.75}, abs=1e-3)
+    rows = {row["sign_id"]: row for row in table.to_pylist()}
+    assert (rows["534"]["sign_class"], rows["534"]["kind"]) == ("variable_sign", "main")
+    assert read(signal("1", '<staticBoard><sign id="2" type="206"/></staticBoard>')).table.num_rows == 2
+    broken = read(signal("1", '<staticBoard><sign id="2" v="x" type="206"/></staticBoard>'))
+    assert broken.skipped == {NO_PLACE: 1}
+
+
+@pytest.mark.parametrize(
+    ("inside", "kind", "sign_class"),
+    [
+        ('<semantics><speed type="maximum" value="60" unit="km/h"/></semantics>', "main", "speed_limit:60"),
+        ('<semantics><speed type="maximum" value="60" unit="mph"/></semantics>', "main", "speed_limit:60mph"),
+        ('<semantics><priority type="stopLine"/></semantics>', "marking", "stop_line"),
+        ('<semantics><supplementaryTime type="day" value="1"/></semantics>', "plate", "plate_other"),
+        ("<semantics><tourist/></semantics>", "main", "raw:X9"),
+        ("<semantics/>", "main", "raw:X9"),
+    ],
+)
+def test_semantics_say_what_an_unknown_code_means(read, inside, kind, sign_class):
+    row = read(signal("1", inside, type="X9", country="")).table.to_pylist()[0]
+    assert (row["kind"], row["sign_class"], row["raw_code"]) == (kind, sign_class, "X9")
+    known = read(signal("1", '<semantics><priority type="stop"/></semantics>')).table.to_pylist()[0]
+    assert known["sign_class"] == "yield"
