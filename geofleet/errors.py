@@ -13,6 +13,9 @@ A message says what is wrong, where, and what to do next, in that order.
 
 from __future__ import annotations
 
+# Begins the name of a count that is a warning: what can hardly be true, and yet is no error
+SUSPICIOUS = "SUSPICIOUS: "
+
 
 class GeofleetError(Exception):
     """Base of all errors whose message is meant for the user.

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from geofleet.errors import SUSPICIOUS
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
@@ -56,8 +58,12 @@ class _Lines:
 
 
 def print_result(result: Any, *, as_json: bool) -> None:
-    """Print the result of a step: one JSON object, or a line a field; fields that are empty are left out."""
+    """Print the result of a step: one JSON object, or a line a field; fields that are empty are left out.
+
+    What can hardly be true of the input is a warning, on standard error as well.
+    """
     fields = asdict(result)
+    warn(fields.get("found"))
     if as_json:
         print_json(fields)
         return
@@ -69,6 +75,13 @@ def print_result(result: Any, *, as_json: bool) -> None:
             value = ", ".join(map(str, value))  # noqa: PLW2901 (text)
         if value not in ("", None):
             typer.echo(f"  {name.ljust(width)}  {value}")
+
+
+def warn(found: Any) -> None:
+    """Say aloud which counts of a reader tell of what can hardly be true."""
+    for name, number in (found or {}).items():
+        if name.startswith(SUSPICIOUS):
+            typer.echo(f"geofleet: warning: {number} positions {name.removeprefix(SUSPICIOUS)}", err=True)
 
 
 def print_json(value: Any) -> None:

@@ -20,7 +20,7 @@ from geofleet.formats.inventory_columns import choose_columns, numbers, parse_fa
 from geofleet.formats.inventory_files import detect, read_features
 from geofleet.formats.inventory_layer import is_own_layer, own_layer
 from geofleet.formats.inventory_places import Places, place_features
-from geofleet.formats.positions import country_at, doubts
+from geofleet.formats.positions import area_doubt, country_at, doubts
 from geofleet.formats.reading import LayerRead
 from geofleet.formats.xml import explained
 from geofleet.tables.schemas import SIGNS
@@ -108,6 +108,7 @@ def _read(path: Path, features: Features, named: Mapping[str, str], options: Map
         f"{thing} read from column {getattr(chosen, thing)} (guessed)": features.table.num_rows for thing in guessed
     }
     found |= doubts(places.lon, places.lat, plates.main_country(), where=str(path))
+    found |= area_doubt(places.crs, places.lon, places.lat)
     signs, doubtful = _signs(path, table, chosen, places, plates, day_first=options.get("day_first"))
     skipped = Counter(features.skipped) + Counter(places.skipped) + Counter(plates.skipped)
     told_all = {reason: count for reason, count in (found | doubtful).items() if count}

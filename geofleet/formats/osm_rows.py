@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 
 from geofleet.formats.osm_spool import NODE
 from geofleet.formats.osm_tags import is_sign_key, node_signs
+from geofleet.formats.positions import PlaceCheck
 from geofleet.tables.schemas import SIGNS
 from geofleet.tables.store import arrow_numbers, arrow_texts, build_table
 
@@ -64,6 +65,9 @@ class TagSigns:
         self.facing_deg = np.array(stated, np.float64)
         self.side = np.array([sign.side for _, sign in self._flat], object)
         self.country = [sign.country for _, sign in self._flat]
+        countries = [next((sign.country for _, sign in signs if sign.country), None) for signs in said]
+        self.lands = list(dict.fromkeys(countries))
+        self.land = np.array([self.lands.index(country) for country in countries], np.int64)
 
     def templates(self, tagset: Ints) -> tuple[Ints, Ints]:
         """Return of each row the place of its node, and that of its sign among those of all tags."""
@@ -125,14 +129,24 @@ class SignRows:
             self.found.update({INFERRED: 0, NO_ROAD: 0, EDGE: self._roads.n_missing_nodes})
             index = RoadIndex(self._roads)
         twice = _mapped_twice(self._nodes.spool, self._tags)
+        check = PlaceCheck(self._source)
         n_pieces = 0
         for nodes in self._nodes.spool.in_text_order():
             kept = self._kept(nodes, twice)
             if len(kept):
                 n_pieces += 1
+                self._look_at(kept, check)
                 yield self._table(kept, index)
         if not n_pieces:
             yield self._table(np.zeros(0, NODE), index)
+        self.found.update(check.doubts())
+
+    def _look_at(self, nodes: Nodes, check: PlaceCheck) -> None:
+        """Hold positions against the countries that the tags name."""
+        lon, lat, land = nodes["lon_e7"] / _E7, nodes["lat_e7"] / _E7, self._tags.land[nodes["tagset"]]
+        for number in np.unique(land):
+            there = land == number
+            check.add(lon[there], lat[there], self._tags.lands[number])
 
     def _kept(self, nodes: Nodes, twice: Ints) -> Nodes:
         """Leave out nodes nowhere on Earth, given before, or mapped on the road as well as beside it."""

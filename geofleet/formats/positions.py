@@ -6,12 +6,16 @@ be true is counted under a text that starts with `SUSPICIOUS`.
 
 from __future__ import annotations
 
+import json
+from collections import Counter
+from functools import cache
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import shapely
 
-from geofleet.algorithms.geodesy import to_ecef
-from geofleet.errors import InputError
+from geofleet.errors import SUSPICIOUS, InputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,32 +23,66 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
 
-SUSPICIOUS = "SUSPICIOUS: "
 _MAX_LON_DEG, _MAX_LAT_DEG = 180.0, 90.0
 _NULL_ISLAND_DEG, _EMPTY_SEA_DEG = 0.001, 1.5  # no land within 1.5 degrees of 0 N 0 E but for one buoy
 _ALONE_M = 100_000.0
+_CELL_DEG = 0.1  # places are looked up by cell: the outlines have a margin of three of them
+_AREA_MARGIN_DEG, _ANTARCTIC_DEG = 0.5, -60.0
 
-# West, south, east, north of the land that a national scheme applies to, with a margin of some 10 km
-COUNTRY_BOXES = {
-    "AT": (9.4, 46.3, 17.3, 49.1),
-    "BE": (2.4, 49.4, 6.5, 51.6),
-    "CH": (5.8, 45.7, 10.6, 47.9),
-    "CZ": (12.0, 48.5, 19.0, 51.2),
-    "DE": (5.7, 47.2, 15.2, 55.2),
-    "DK": (7.9, 54.4, 15.3, 57.9),
-    "EE": (21.6, 57.4, 28.3, 59.8),
-    "ES": (-18.3, 27.5, 4.5, 43.9),
-    "FI": (19.0, 59.4, 31.7, 70.2),
-    "FR": (-5.3, 41.2, 9.7, 51.2),
-    "GB": (-8.8, 49.8, 1.9, 61.0),
-    "IT": (6.5, 35.3, 18.7, 47.2),
-    "LU": (5.6, 49.4, 6.6, 50.3),
-    "NL": (3.2, 50.6, 7.4, 53.7),
-    "NO": (4.3, 57.8, 31.3, 71.3),
-    "PL": (14.0, 48.9, 24.3, 55.0),
-    "SE": (10.8, 55.2, 24.3, 69.2),
-    "US": (-179.5, 18.8, -66.8, 71.5),
-}
+
+class PlaceCheck:
+    """Looks at positions, some at a time, for what can hardly be true of them.
+
+    Parameters
+    ----------
+    where
+        The file, for messages.
+    """
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+        self._n: Counter[str] = Counter()
+        self._outside: Counter[str] = Counter()
+        self._swapped: Counter[str] = Counter()
+
+    def add(self, lon: Floats, lat: Floats, country: str | None) -> None:
+        """Look at valid positions of signs of one country, None where it is not known."""
+        if not len(lon):
+            return
+        sea = (np.abs(lon) < _EMPTY_SEA_DEG) & (np.abs(lat) < _EMPTY_SEA_DEG)
+        cell = np.floor(np.column_stack((lon, lat)) / _CELL_DEG).astype(np.int64)
+        cells, of_point = np.unique(cell, axis=0, return_inverse=True)
+        x, y = ((cells + 0.5) * _CELL_DEG).T
+        in_cell = np.bincount(of_point.ravel(), minlength=len(cells))
+        self._n["all"] += len(lon)
+        self._n["guinea"] += int(sea.sum())
+        self._n["no land"] += int(in_cell[~_is_on_land(x, y)].sum())
+        if country in outlines():
+            self._outside[country] += int(in_cell[~is_within(country, x, y)].sum())
+            self._swapped[country] += int(in_cell[is_within(country, y, x)].sum())
+
+    def doubts(self) -> dict[str, int]:
+        """Return what can hardly be true, with counts.
+
+        Raises
+        ------
+        InputError
+            Most points lie in the Gulf of Guinea; or outside of the country, and inside with the axes exchanged.
+        """
+        n_all, n_outside = self._n["all"], self._outside.total()
+        if 2 * self._n["guinea"] > n_all:
+            raise _guinea(self._n["guinea"], n_all, self._where)
+        lands = ", ".join(country for country, n in self._outside.items() if n)
+        if 2 * n_outside > n_all and 2 * self._swapped.total() > n_all:
+            raise InputError(
+                f"{n_outside} of {n_all} positions lie outside of {lands}, and inside with the axes swapped.",
+                where=self._where,
+                todo="Latitude and longitude are exchanged: swap them (swap_xy), or name the right x and y columns.",
+            )
+        found = {f"{SUSPICIOUS}outside of {lands}; is the CRS right?": n_outside} if n_outside else {}
+        if 2 * self._n["no land"] > n_all:
+            found[f"{SUSPICIOUS}over 30 km from any land; is the CRS right?"] = self._n["no land"]
+        return found
 
 
 def to_lonlat(x: Floats, y: Floats, crs: Any, *, where: str) -> tuple[Floats, Floats]:
@@ -88,11 +126,7 @@ def reject_null_island(lon: Floats, lat: Floats, *, where: str) -> Flags:
     sea = (np.abs(lon) < _EMPTY_SEA_DEG) & (np.abs(lat) < _EMPTY_SEA_DEG)
     null = (np.abs(lon) < _NULL_ISLAND_DEG) & (np.abs(lat) < _NULL_ISLAND_DEG)
     if 2 * sea.sum() > len(lon):
-        raise InputError(
-            f"{sea.sum()} of {len(lon)} positions lie in the Gulf of Guinea, by 0° N 0° E: the CRS is wrong.",
-            where=where,
-            todo="Give the CRS of the coordinates with --crs.",
-        )
+        raise _guinea(int(sea.sum()), len(lon), where)
     return np.asarray(null, bool)
 
 
@@ -104,18 +138,9 @@ def doubts(lon: Floats, lat: Floats, country: str | None, *, where: str) -> dict
     InputError
         Most points lie outside of the country, and inside when longitude and latitude are exchanged.
     """
-    found = {}
-    box = COUNTRY_BOXES.get(country or "")
-    if box and len(lon):
-        outside = int((~_inside(box, lon, lat)).sum())
-        if 2 * outside > len(lon) and 2 * _inside(box, lat, lon).sum() > len(lon):
-            raise InputError(
-                f"{outside} of {len(lon)} positions lie outside of {country}, and inside with the axes swapped.",
-                where=where,
-                todo="Latitude and longitude are exchanged: swap them (swap_xy), or name the right x and y columns.",
-            )
-        if outside:
-            found[f"{SUSPICIOUS}outside of {country}; is the CRS right?"] = outside
+    check = PlaceCheck(where)
+    check.add(lon, lat, country)
+    found = check.doubts()
     alone = int(_alone(lon, lat).sum())
     if alone:
         found[f"{SUSPICIOUS}over 100 km from any other; are these positions right?"] = alone
@@ -123,8 +148,58 @@ def doubts(lon: Floats, lat: Floats, country: str | None, *, where: str) -> dict
 
 
 def country_at(lon: float, lat: float) -> set[str]:
-    """Return the countries whose box holds a point."""
-    return {name for name, box in COUNTRY_BOXES.items() if _inside(box, np.array([lon]), np.array([lat]))[0]}
+    """Return the countries whose outline, with its margin, holds a point."""
+    return {name for name in outlines() if is_within(name, np.array([lon]), np.array([lat]))[0]}
+
+
+def is_within(country: str, lon: Floats, lat: Floats) -> Flags:
+    """Tell which points lie in a country of `outlines`, or within a margin of some 30 km around it."""
+    return np.asarray(shapely.contains_xy(outlines()[country], lon, lat), bool)
+
+
+def area_doubt(crs: Any, lon: Floats, lat: Floats) -> dict[str, int]:
+    """Return how many points lie far from where a CRS is meant to be used, when most do."""
+    from pyproj import CRS  # noqa: PLC0415  (takes a moment to load)
+
+    area = CRS.from_user_input(crs).area_of_use
+    if area is None or not len(lon):
+        return {}
+    width = (area.east - area.west) % 360.0 or 360.0
+    beyond = (lon - area.west + _AREA_MARGIN_DEG) % 360.0 > width + 2.0 * _AREA_MARGIN_DEG
+    beyond |= (lat < area.south - _AREA_MARGIN_DEG) | (lat > area.north + _AREA_MARGIN_DEG)
+    told = f"{SUSPICIOUS}outside of {area.name[:80]}, which the CRS is meant for; is the CRS right?"
+    return {told: int(beyond.sum())} if 2 * beyond.sum() > len(lon) else {}
+
+
+@cache
+def outlines() -> dict[str, Any]:
+    """Return outlines of countries, Natural Earth's with a margin, by ISO 3166-1 alpha-2."""
+    text = resources.files("geofleet.formats").joinpath("country_outlines.json").read_text(encoding="utf-8")
+    found = {
+        code: shapely.multipolygons(list(map(shapely.polygons, rings))) for code, rings in json.loads(text).items()
+    }
+    for shape in found.values():
+        shapely.prepare(shape)
+    return found
+
+
+def _is_on_land(lon: Floats, lat: Floats) -> Flags:
+    """Tell which points lie in any country; most are in that of the first one."""
+    is_there = np.zeros(len(lon), bool)
+    for shape in outlines().values():
+        open_ = np.flatnonzero(~is_there)
+        if not len(open_):
+            break
+        is_there[open_] = shapely.contains_xy(shape, lon[open_], lat[open_])
+    return is_there | (lat < _ANTARCTIC_DEG)
+
+
+def _guinea(n_there: int, n_all: int, where: str) -> InputError:
+    return InputError(
+        f"{n_there} of {n_all} positions lie in the Gulf of Guinea, by 0° N 0° E: the CRS is wrong.",
+        where=where,
+        todo="Give the CRS of the coordinates with --crs.",
+    )
 
 
 def _refuse_contradiction(x: Floats, y: Floats, degrees: Flags, crs: Any, where: str) -> None:
@@ -145,14 +220,11 @@ def _refuse_contradiction(x: Floats, y: Floats, degrees: Flags, crs: Any, where:
         )
 
 
-def _inside(box: tuple[float, float, float, float], lon: Floats, lat: Floats) -> Flags:
-    west, south, east, north = box
-    return np.asarray((lon >= west) & (lon <= east) & (lat >= south) & (lat <= north), bool)
-
-
 def _alone(lon: Floats, lat: Floats) -> Flags:
     """Return which points have no other one within `_ALONE_M`, when most have."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  (takes a moment to load)
+
+    from geofleet.algorithms.geodesy import to_ecef  # noqa: PLC0415  (as above)
 
     place = np.unique(np.column_stack((lon, lat)), axis=0)
     if len(place) < 3:  # noqa: PLR2004  (of two, none is the odd one)

@@ -16,12 +16,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from geofleet.errors import ConfigError, InputError
+from geofleet.errors import SUSPICIOUS, ConfigError, InputError
 from geofleet.formats import layers
 from geofleet.formats.reading import LayerStream, read_head
 from geofleet.tables.manifest import write_manifest
-from geofleet.tables.schemas import DRIVES, LANES, SIGNS
-from geofleet.tables.store import sort_by_key, write_pieces
+from geofleet.tables.schemas import BBOX, DRIVES, LANES, SIGNS
+from geofleet.tables.store import lonlat, sort_by_key, write_pieces
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     Progress = Callable[[int, int], None]
     Reader = Callable[[Path], LayerRead | LayerStream]
 
+_FAR_M = 100_000.0
 _GLOBAL_IDS = frozenset({"osm", "geofleet"})
 
 
@@ -224,7 +225,7 @@ def _ingest(
         if progress:
             progress(done, len(plan))
         layers_read.append(reader(path))
-    n_rows = write_pieces(schema, _counted(_pieces(schema, layers_read, skipped), kind, kinds), Path(out))
+    n_rows = write_pieces(schema, _counted(_pieces(schema, plan, layers_read, skipped, found), kind, kinds), Path(out))
     for layer in layers_read:
         skipped.update(layer.skipped)
         found.update(layer.found)
@@ -242,12 +243,43 @@ def _ingest(
     return IngestResult(schema.name, Path(out), n_rows, by_kind, dict(found), dict(skipped), formats)
 
 
-def _pieces(schema: Schema, read: list[LayerRead | LayerStream], skipped: Counter[str]) -> Iterator[pa.Table]:
+def _pieces(
+    schema: Schema,
+    plan: Sequence[tuple[Path, str, Reader]],
+    read: list[LayerRead | LayerStream],
+    skipped: Counter[str],
+    found: Counter[str],
+) -> Iterator[pa.Table]:
     """Return the rows to write: of one file piece by piece, where it comes so; of several put together."""
     only = read[0]
     if len(read) == 1 and isinstance(only, LayerStream):
         return only.pieces()
-    return iter([_together(schema, _told_apart(schema, read), skipped)])
+    tables = _told_apart(schema, read)
+    found.update(_far_apart(plan, tables))
+    return iter([_together(schema, tables, skipped)])
+
+
+def _far_apart(plan: Sequence[tuple[Path, str, Reader]], tables: Sequence[pa.Table]) -> dict[str, int]:
+    """Return the inputs whose middle lies over `_FAR_M` beyond the reach of every other one's rows, with their rows."""
+    some = [(path.name, table) for (path, *_), table in zip(plan, tables, strict=True) if table.num_rows]
+    if len(some) < 2 or any(BBOX not in table.column_names for _, table in some):  # noqa: PLR2004 - apart from what?
+        return {}
+    from geofleet.algorithms.geodesy import to_ecef  # noqa: PLC0415  (brings pyproj, which one map does without)
+
+    middle, reach_m = [], []
+    for _, table in some:
+        lon, lat = lonlat(table)
+        xyz = to_ecef(lon, lat)
+        middle.append(np.median(xyz, axis=0))
+        reach_m.append(float(np.linalg.norm(xyz - middle[-1], axis=1).max()))
+    apart_m = np.linalg.norm(np.array(middle)[:, None] - np.array(middle)[None], axis=2)
+    gap_m = apart_m - np.add.outer(reach_m, reach_m)
+    np.fill_diagonal(gap_m, np.inf)
+    return {
+        f"{SUSPICIOUS}in {name}, over {_FAR_M / 1000:.0f} km from every other input; is its CRS right?": table.num_rows
+        for (name, table), gap in zip(some, gap_m.min(axis=1), strict=True)
+        if gap > _FAR_M
+    }
 
 
 def _told_apart(schema: Schema, read: list[LayerRead | LayerStream]) -> list[pa.Table]:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from geofleet.errors import GeofleetError
+from geofleet.errors import SUSPICIOUS, GeofleetError
 from geofleet.formats.layers import FORMATS, read_layer
-from geofleet.formats.positions import SUSPICIOUS
 from geofleet.tables.schemas import BBOX, DRIVES, LANES, SIGNS
 from geofleet.taxonomy.reader import RAW_PREFIX
 from geofleet.workflows.anyfile import read_any

@@ -564,3 +564,46 @@ def test_damaged_files_never_give_another_error(frame, tmp_path, name):
         path.write_bytes(broken)
         with reads_or_says_why(path):
             read_signs(path, country="BE")
+
+
+# ---- a layer in the wrong place --------------------------------------------------------------------------------------
+
+
+def shifted(tmp_path, *, lon, lat, country):
+    rows = "".join(f"{i},{lon + i * 1e-3},{lat},205,{country}\n" for i in range(9))
+    path = tmp_path / "shifted.csv"
+    path.write_text(f"id,lon,lat,code,country\n{rows}", encoding="utf-8")
+    return read_signs(path).found
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "country", "is_told"),
+    [
+        (8.8, 53.1, "DE", False),
+        (10.8, 55.1, "DE", True),  # Bremen two degrees off, in the Danish sea, and within any box around Germany
+        (6.8, 51.1, "DE", False),  # two degrees off, and still in Germany: nothing in the file can tell
+        (24.94, 60.17, "FI", False),
+        (26.94, 58.17, "FI", True),
+        (3.5, 51.1, "BE", False),
+        (5.5, 53.1, "BE", True),
+        (-93.0, 45.0, "US", False),
+        (-16.0, 28.3, "ES", False),  # islands are land, too
+        (20.0, 60.2, "FI", False),
+    ],
+)
+def test_a_layer_two_degrees_off_is_told(tmp_path, lon, lat, country, is_told):
+    told = [name for name in shifted(tmp_path, lon=lon, lat=lat, country=country) if name.startswith(SUSPICIOUS)]
+    assert bool(told) == is_told
+    assert all(country in name or "any land" in name for name in told)
+
+
+def test_a_layer_in_the_sea_is_told_without_a_country(tmp_path):
+    told = [n for n in shifted(tmp_path, lon=-30.0, lat=45.0, country="") if n.startswith(SUSPICIOUS)]
+    assert told == [f"{SUSPICIOUS}over 30 km from any land; is the CRS right?"]
+
+
+def test_a_crs_that_is_not_for_the_place_is_told(tmp_path):
+    path = tmp_path / "far.csv"
+    path.write_text("id,x,y,code\n1,900000,900000,B1\n2,900100,900000,B1\n", encoding="utf-8")
+    told = [name for name in read_signs(path, crs="EPSG:31370").found if name.startswith(SUSPICIOUS)]
+    assert any("Belgium" in name for name in told)

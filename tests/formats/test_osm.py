@@ -249,3 +249,21 @@ def test_damage_gives_an_input_error_or_a_layer(helsinki, tmp_path, seed):
         assert read_signs(damaged).table.num_rows >= 0
     except InputError as error:
         assert str(damaged) in str(error)  # noqa: PT017 - either outcome is right
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "told"),
+    [(10.0, 50.0, []), (17.4, 54.5, ["outside of DE; is the CRS right?"])],
+)
+def test_signs_outside_of_their_country_are_told(tmp_path, lon, lat, told):
+    body = "".join(node(i, lon, lat + i * 1e-4, traffic_sign="DE:206") for i in range(1, 8))
+    layer = read_signs(xml(tmp_path, body))
+    assert layer.table.num_rows == 7
+    assert [n.removeprefix("SUSPICIOUS: ") for n in layer.found if n.startswith("SUSPICIOUS: ")] == told
+
+
+@pytest.mark.parametrize(("lon", "lat", "message"), [(0.2, 0.1, "Gulf of Guinea"), (50.0, 10.0, "axes swapped")])
+def test_a_map_in_the_wrong_place_is_refused(tmp_path, lon, lat, message):
+    body = "".join(node(i, lon, lat + i * 1e-4, traffic_sign="DE:206") for i in range(1, 8))
+    with pytest.raises(InputError, match=message):
+        read_signs(xml(tmp_path, body)).table.num_rows  # noqa: B018 - rows are read when asked for
