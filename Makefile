@@ -19,7 +19,7 @@ REPLICATES ?= 1
 SEED ?= 0
 CODE := $(shell find geofleet sql -name '*.py' -o -name '*.sql' -o -name '*.toml' -o -name '*.csv' -o -name '*.html' 2>/dev/null)
 
-.PHONY: FORCE help setup demo test check ingest simulate aggregate evaluate report format lock clean
+.PHONY: FORCE help setup demo test check study results environments ingest simulate aggregate evaluate report format lock clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -80,6 +80,28 @@ $(P)/evaluation/_manifest.json: $(P)/fused/fused_manifest.json
 
 $(P)/report/_manifest.json: $(P)/evaluation/_manifest.json $(P)/lanes/lanes_manifest.json
 	$(GEOFLEET) report $(P)
+
+STUDY := $(P)/study
+FLEETS ?= 10
+STUDY_OPTIONS = --out $(STUDY) --scenario $(SCENARIO) --replicates $(FLEETS) --seed $(SEED)
+
+study: $(STUDY)/compare/_manifest.json $(STUDY)/fleet-size/_manifest.json $(STUDY)/sweep-semantic_rate/_manifest.json ## The paper's Table 2 and Figures 3 to 5
+	@echo "Figures and tables are in $(STUDY); make results writes docs/results.md from them."
+
+$(STUDY)/compare/_manifest.json: $(CODE) | $(READY)
+	$(GEOFLEET) study compare $(STUDY_OPTIONS)
+
+$(STUDY)/fleet-size/_manifest.json: $(STUDY)/compare/_manifest.json
+	$(GEOFLEET) study fleet-size $(STUDY_OPTIONS)
+
+$(STUDY)/sweep-semantic_rate/_manifest.json: $(STUDY)/fleet-size/_manifest.json
+	$(GEOFLEET) study compare $(STUDY_OPTIONS) --methods dbscan,hdbscan,kmeans,kmedoids --sweep semantic_rate=0.9,0.95,0.98,0.99,1
+
+environments: | $(READY) ## Urban, highway, rural and mixed fleets (the maps are in ../shared/data)
+	$(BIN)/python scripts/study_environments.py --out $(STUDY)
+
+results: study ## Write docs/results.md from what the studies found
+	$(BIN)/python scripts/write_results.py $(STUDY)
 
 test: $(READY) ## Set up and pass every test
 	$(BIN)/pytest -q -n 2 --dist loadfile

@@ -175,15 +175,12 @@ def test_in_view_leaves_out_what_no_pass_could_see(inputs, tmp_path):
 
 
 def test_methods_are_names_of_settings():
-    assert [m.label for m in parse_methods("dbscan, kmeans-after,joint,dbscan-first")] == [
-        "dbscan-first",
-        "kmeans-after",
-        "joint",
-    ]
+    labels = [method.label for method in parse_methods("dbscan, kmeans-after,dbscan-corrected,dbscan-first")]
+    assert labels == ["dbscan-first", "kmeans-after", "dbscan-corrected"]
     assert METHODS["kmedoids-first"].has_oracle_k
     assert Staleness(0.15, 0.10, 0.10, 0.10, moved_m=5.0, sigma_m=0.15) == USUAL_PRIOR
-    with pytest.raises(ConfigError, match="Did you mean joint"):
-        parse_methods("jonit")
+    with pytest.raises(ConfigError, match="Did you mean kmedoids"):
+        parse_methods("kmedoid")
     with pytest.raises(ConfigError, match="no method"):
         parse_methods(",")
 

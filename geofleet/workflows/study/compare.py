@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from geofleet.formats.study_figures import COLOURS, NAMES, draw_curves, draw_paper, figure_file
-from geofleet.workflows.study.methods import CORRECTED, JOINT, TABLE_2
+from geofleet.workflows.study.methods import CORRECTED, JOINT, TABLE_2, default_methods
 from geofleet.workflows.study.paper import paper_curve, paper_table
 from geofleet.workflows.study.results import GROUP, find, write_study
 from geofleet.workflows.study.units import run_study
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     Rows = Sequence[Mapping[str, Any]]
 
-DEFAULT_METHODS = ",".join((*TABLE_2, CORRECTED, JOINT))
+DEFAULT_METHODS = default_methods(*TABLE_2, CORRECTED, JOINT)
 DEFAULT_SIZES = (50,)
 SHOWN = ("precision", "recall", "f1", "gospa_m")
 
@@ -62,7 +62,9 @@ def compare(
     def draw(folder: Path, summary: list[dict[str, Any]]) -> None:
         draw_comparison(folder, summary, caption)
 
-    summary, files = write_study("compare", study, rows, out, draw=draw)
+    keys = {world.setting.partition("=")[0] for world in study.worlds}
+    name = f"sweep-{keys.pop()}" if len(study.worlds) > 1 and keys != {""} and len(keys) == 1 else "compare"
+    summary, files = write_study(name, study, rows, out, draw=draw)
     return CompareResult(caption, tuple(table_rows(summary)), files)
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import difflib
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from geofleet.config import AggregateConfig
 from geofleet.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -57,14 +58,21 @@ def _methods() -> dict[str, Method]:
         for name in CLUSTERING
         for order in ("first", "after")
     }
-    corrected = {"method": "dbscan", "semantic": "first", "correct_bias": True}
+    corrected: dict[str, Any] = {"method": "dbscan", "semantic": "first", "correct_bias": True}
     methods[CORRECTED] = Method(CORRECTED, corrected, "information")
+    if JOINT not in get_args(AggregateConfig.model_fields["method"].annotation):
+        return methods
     methods[JOINT] = Method(JOINT, {"method": "joint"}, "information", has_passes=True)
     methods[JOINT_PRIOR] = Method(JOINT_PRIOR, {"method": "joint"}, "information", has_passes=True, has_prior=True)
     return methods
 
 
 METHODS: Mapping[str, Method] = MappingProxyType(_methods())
+
+
+def default_methods(*labels: str) -> str:
+    """Return those of some methods that there are, as `parse_methods` reads them."""
+    return ",".join(label for label in labels if label in METHODS)
 
 
 def parse_methods(text: str) -> tuple[Method, ...]:
@@ -79,7 +87,7 @@ def parse_methods(text: str) -> tuple[Method, ...]:
     labels = [f"{name}-first" if name in CLUSTERING else name for name in names]
     for name, label in zip(names, labels, strict=True):
         if label not in METHODS:
-            near = difflib.get_close_matches(name, METHODS, n=1)
+            near = difflib.get_close_matches(name, [*CLUSTERING, *METHODS], n=1)
             todo = f"Did you mean {near[0]}?" if near else f"Methods are {', '.join(METHODS)}."
             raise ConfigError(f"unknown method {name!r}.", where="--methods", todo=todo)
     if not labels:
