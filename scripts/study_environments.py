@@ -13,6 +13,7 @@ import argparse
 import os
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -117,9 +118,7 @@ def main() -> None:
         caption = describe(study)
         write_study(
             *(name, study, rows, args.out),
-            draw=lambda folder, summary, name=name, by=by, caption=caption: draw(
-                folder, summary, name=name, by=by, caption=caption
-            ),
+            draw=partial(draw, name=name, by=by, caption=caption),
         )
         print(f"{name}: {args.out / name}")
 

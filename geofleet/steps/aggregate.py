@@ -195,7 +195,7 @@ def _stage(
     passes: Path | None,
     n_workers: int,
 ) -> Staged:
-    connection = connect(threads=n_workers, memory_limit=DUCKDB_MEMORY)
+    connection = connect(threads=n_workers, memory_limit=DUCKDB_MEMORY, spatial=False)
     try:
         return stage_detections(
             connection,

@@ -18,11 +18,16 @@ SELECT
     cell_y,
     n_points,
     zoom,
-    -- named by the middle of the cell: a corner may be rounded into the next tile
-    ST_QuadKey(
-        (cell_x + 0.5) / (1 << $fine_zoom) * 360 - 180,
-        degrees(atan(sinh(pi() * (1 - 2 * (cell_y + 0.5) / (1 << $fine_zoom))))),
-        zoom
+    -- the quadkey, without the spatial extension, which takes longer to load than a small fleet to map
+    array_to_string(
+        list_transform(
+            range(1, zoom + 1),
+            lambda depth: (
+                ((cell_x >> ($fine_zoom - depth::INTEGER)) & 1)
+                + 2 * ((cell_y >> ($fine_zoom - depth::INTEGER)) & 1)
+            )
+        ),
+        ''
     ) AS tile
 FROM levels
 WHERE n_in_tile <= $batch_rows OR zoom = $fine_zoom
