@@ -33,8 +33,7 @@ def within_corridor(lon_deg: Floats, lat_deg: Floats, frame: EnuFrame, line: Dri
     """
     up = to_ecef([frame.origin_lon_deg], [frame.origin_lat_deg])[0]
     local: Flags = to_ecef(lon_deg, lat_deg) @ up > 0
-    distance_m = _distance_to_line(frame.to_enu(lon_deg, lat_deg), line.xy_m, line.starts)
-    return local & (distance_m <= corridor_m)
+    return local & _near_line(frame.to_enu(lon_deg, lat_deg), line.xy_m, line.starts, corridor_m)
 
 
 def nearest_m(lon_deg: Floats, lat_deg: Floats, frame: EnuFrame, line: DriveLine) -> float:
@@ -60,15 +59,17 @@ def is_repeated(xy_m: Floats, sign_class: Sequence[str], support_id: Sequence[st
     return repeated
 
 
-@njit(cache=True)
-def _distance_to_line(xy_m: Floats, line_xy_m: Floats, starts: Ints) -> Floats:
-    nearest = np.full(len(xy_m), np.inf)
+@njit(cache=True, nogil=True)
+def _near_line(xy_m: Floats, line_xy_m: Floats, starts: Ints, corridor_m: float) -> Flags:
+    near = np.zeros(len(xy_m), dtype=np.bool_)
     for part in range(len(starts) - 1):
         for k in range(starts[part], starts[part + 1] - 1):
             step_x, step_y = line_xy_m[k + 1, 0] - line_xy_m[k, 0], line_xy_m[k + 1, 1] - line_xy_m[k, 1]
             squared = step_x * step_x + step_y * step_y
+            reach = corridor_m + np.sqrt(squared)
             for i in range(len(xy_m)):
                 dx, dy = xy_m[i, 0] - line_xy_m[k, 0], xy_m[i, 1] - line_xy_m[k, 1]
-                share = min(max((dx * step_x + dy * step_y) / squared, 0.0), 1.0)
-                nearest[i] = min(nearest[i], np.hypot(dx - share * step_x, dy - share * step_y))
-    return nearest
+                if abs(dx) <= reach and abs(dy) <= reach and not near[i]:
+                    share = min(max((dx * step_x + dy * step_y) / squared, 0.0), 1.0)
+                    near[i] = np.hypot(dx - share * step_x, dy - share * step_y) <= corridor_m
+    return near

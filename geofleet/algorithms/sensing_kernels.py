@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
 
+ROUNDING_M = 1e-6
+"""A view cone is taken to be this much larger when cells are chosen: rounding must not lose a sign on its edge."""
+
 
 @njit(cache=True, nogil=True)
 def in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
@@ -29,19 +32,21 @@ def in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
 ) -> tuple[Ints, Ints, Floats, Floats]:
     """Return frame, sign, distance in metres and bearing in radians of every sign in the cone, by frame.
 
-    Signs lie in a grid of square cells of `cell_m`, at least `range_m` wide (`cell_start`, `cell_sign`, by row), so a
-    frame looks at nine cells. The angle is compared by its cosine, which falls all the way from 0 to π.
+    Signs lie in a grid of square cells of `cell_m` (`cell_start`, `cell_sign`, by row; cells of a row are neighbours in
+    memory), and a frame looks into those that the box around its view cone touches. The angle is compared by its
+    cosine, which falls all the way from 0 to π.
     """
     # Room for every candidate: arrays that grow inside the loop make it three times as slow.
-    room = _n_candidates(pose_xy_m, cell_start, origin_xy_m, shape, cell_m)
+    room = _n_candidates(pose_xy_m, heading_rad, cell_start, origin_xy_m, shape, cell_m, range_m, half_fov_rad)
     frames, signs = np.empty(room, np.int64), np.empty(room, np.int64)
     distances, forwards, lefts = np.empty(room), np.empty(room), np.empty(room)
     n, cos_half = 0, np.cos(half_fov_rad)
     for frame in range(len(pose_xy_m)):
         x, y = pose_xy_m[frame, 0], pose_xy_m[frame, 1]
         ahead_x, ahead_y = np.cos(heading_rad[frame]), np.sin(heading_rad[frame])
-        rows, columns = _around(x, y, origin_xy_m, shape, cell_m)
-        for row in range(rows[0], rows[1]):
+        columns = _cells(x - origin_xy_m[0], ahead_x, ahead_y, cell_m, shape[1], range_m, half_fov_rad)
+        rows = _cells(y - origin_xy_m[1], ahead_y, ahead_x, cell_m, shape[0], range_m, half_fov_rad)
+        for row in range(rows[0], rows[1] if columns[0] < columns[1] else 0):
             for k in range(cell_start[row * shape[1] + columns[0]], cell_start[row * shape[1] + columns[1]]):
                 dx, dy = sign_xy_m[cell_sign[k], 0] - x, sign_xy_m[cell_sign[k], 1] - y
                 square = dx * dx + dy * dy
@@ -58,24 +63,41 @@ def in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
 
 
 @njit(cache=True, nogil=True)
-def _around(
-    x_m: float, y_m: float, origin_xy_m: Floats, shape: tuple[int, int], cell_m: float
-) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the rows and columns, half-open, of the cells around a place; cells of a row are neighbours in memory."""
-    column, row = int(np.floor((x_m - origin_xy_m[0]) / cell_m)), int(np.floor((y_m - origin_xy_m[1]) / cell_m))
-    columns = max(column - 1, 0), min(column + 2, shape[1])
-    rows = max(row - 1, 0), min(row + 2, shape[0])
-    return rows if columns[0] < columns[1] else (0, 0), columns
+def _cells(  # noqa: PLR0917 - numba takes no keyword-only arguments
+    place_m: float, ahead: float, aside: float, cell_m: float, n_cells: int, range_m: float, half_fov_rad: float
+) -> tuple[int, int]:
+    """Return the first and the last cell, half-open, that a view cone touches along one axis.
+
+    `place_m` is its tip and `ahead` the component of its direction on the axis, `aside` that on the other.
+    """
+    cos_half, sin_half = np.cos(half_fov_rad), np.sin(half_fov_rad)
+    one, two = ahead * cos_half - aside * sin_half, ahead * cos_half + aside * sin_half  # the two edges
+    most = 1.0 if ahead >= cos_half else max(0.0, one, two)
+    least = -1.0 if -ahead >= cos_half else min(0.0, one, two)
+    first = int(np.floor((place_m + least * range_m - ROUNDING_M) / cell_m))
+    last = int(np.floor((place_m + most * range_m + ROUNDING_M) / cell_m))
+    return max(first, 0), max(min(last + 1, n_cells), 0)
 
 
 @njit(cache=True, nogil=True)
-def _n_candidates(
-    pose_xy_m: Floats, cell_start: Ints, origin_xy_m: Floats, shape: tuple[int, int], cell_m: float
+def _n_candidates(  # noqa: PLR0917 - numba takes no keyword-only arguments
+    pose_xy_m: Floats,
+    heading_rad: Floats,
+    cell_start: Ints,
+    origin_xy_m: Floats,
+    shape: tuple[int, int],
+    cell_m: float,
+    range_m: float,
+    half_fov_rad: float,
 ) -> int:
-    """Return how many pairs of a frame and a sign lie in cells next to each other."""
+    """Return how many pairs of a frame and a sign lie in cells that the view cone touches."""
     n = 0
     for frame in range(len(pose_xy_m)):
-        rows, columns = _around(pose_xy_m[frame, 0], pose_xy_m[frame, 1], origin_xy_m, shape, cell_m)
+        ahead_x, ahead_y = np.cos(heading_rad[frame]), np.sin(heading_rad[frame])
+        x, y = pose_xy_m[frame, 0] - origin_xy_m[0], pose_xy_m[frame, 1] - origin_xy_m[1]
+        columns = _cells(x, ahead_x, ahead_y, cell_m, shape[1], range_m, half_fov_rad)
+        rows = _cells(y, ahead_y, ahead_x, cell_m, shape[0], range_m, half_fov_rad)
         for row in range(rows[0], rows[1]):
-            n += cell_start[row * shape[1] + columns[1]] - cell_start[row * shape[1] + columns[0]]
+            if columns[0] < columns[1]:
+                n += cell_start[row * shape[1] + columns[1]] - cell_start[row * shape[1] + columns[0]]
     return n

@@ -25,6 +25,9 @@ def simulate(
     replicates: Annotated[int, typer.Option("--replicates", help="Independent repetitions.")] = 1,
     seed: Annotated[int, typer.Option("--seed", help="Of all random numbers.")] = 0,
     corridor_m: Annotated[float | None, typer.Option(help="Signs this near to the drive are the scene.")] = None,
+    groups: Annotated[
+        str | None, typer.Option(help="Groups of signs in the scene: warning,priority ...", metavar="NAME,...")
+    ] = None,
     respect_facing: Annotated[
         bool | None, typer.Option("--respect-facing", help="A sign is seen from its front only.")
     ] = None,
@@ -39,7 +42,8 @@ def simulate(
     """
     from geofleet.steps import simulate as step
 
-    settled = settle(config or scenario, settings, corridor_m=corridor_m, respect_facing=respect_facing)
+    names = None if groups is None else [name.strip() for name in groups.split(",")]
+    settled = settle(config or scenario, settings, corridor_m=corridor_m, groups=names, respect_facing=respect_facing)
     with progress_bar("simulating") as progress:
         result = step.simulate(
             signs,
