@@ -19,7 +19,7 @@ REPLICATES ?= 1
 SEED ?= 0
 CODE := $(shell find geofleet sql -name '*.py' -o -name '*.sql' -o -name '*.toml' -o -name '*.csv' -o -name '*.html' 2>/dev/null)
 
-.PHONY: FORCE help setup demo test check study results environments ingest simulate aggregate evaluate report format lock clean
+.PHONY: FORCE help setup demo test check study results environments ingest simulate aggregate evaluate report format bench lock clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -112,6 +112,9 @@ check: $(READY) ## Every gate: format, lint, types, import direction, SQL contra
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/pytest -q tests/sql
+
+bench: $(READY) ## The aggregate step beside scikit-learn, dbscan, PostGIS and DuckDB (some minutes)
+	$(BIN)/python benchmarks/aggregate.py
 
 format: $(READY) ## Format the code
 	$(BIN)/ruff format .

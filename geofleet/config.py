@@ -145,6 +145,7 @@ class AggregateConfig(_Section):
     semantic: Literal["first", "after"]
     eps_m: Positive
     min_samples: Annotated[int, Field(ge=1)]
+    min_samples_share: Rate
     min_cluster_size: Annotated[int, Field(ge=2)]
     k: Annotated[int, Field(ge=0)]
     max_k: Annotated[int, Field(ge=1)]

@@ -86,7 +86,7 @@ def dbscan_groups(
     groups: ArrayLike,
     *,
     eps_m: float,
-    min_samples: int,
+    min_samples: int | Ints,
     ecef_m: Floats | None = None,
 ) -> Clusters:
     """Cluster points within groups (classes, tiles, runs) in one pass: no cluster spans two groups.
@@ -97,8 +97,10 @@ def dbscan_groups(
         (n, 2) east and north, metres. Each group may use a frame of its own.
     groups
         (n,) integers from 0.
-    eps_m, min_samples
+    eps_m
         As for `dbscan`.
+    min_samples
+        As for `dbscan`, or (n_groups,) one for each group.
     ecef_m
         (n, 3) Earth-centred coordinates, metres. When given, distances are taken between these and `xy` only says
         where to look for neighbours; it must be a tangent plane with its origin within 25 km.
@@ -111,14 +113,16 @@ def dbscan_groups(
     points, codes = _checked(xy), np.ascontiguousarray(groups, np.int64)
     if not (math.isfinite(eps_m) and eps_m > 0):
         raise InputError(f"eps_m is {eps_m}.", where="dbscan", todo="Give a positive finite distance, e.g. 4.0.")
-    if min_samples < 1:
-        raise InputError(f"min_samples is {min_samples}.", where="dbscan", todo="Give 1 or more, e.g. 3.")
+    if np.min(min_samples, initial=1) < 1:
+        raise InputError(f"min_samples is {np.min(min_samples)}.", where="dbscan", todo="Give 1 or more, e.g. 3.")
     if len(points) == 0:
         nothing = np.empty(0, np.int64)
         return Clusters(nothing, np.empty(0, np.bool_), nothing, nothing)
     cells = _sort_into_cells(points, codes, points if ecef_m is None else ecef_m, eps_m)
     sq_eps = eps_m * eps_m
-    core = kernels.find_cores(cells, sq_eps, min_samples)
+    of_group = np.asarray(min_samples, np.int64)
+    of_group = of_group if of_group.ndim else np.full(int(codes.max()) + 1, of_group)
+    core = kernels.find_cores(cells, sq_eps, of_group[codes[cells.order[cells.first[:-1]]]])
     cluster = kernels.number_clusters(cells, core, sq_eps)
     return Clusters(*kernels.label_points(cells, core, cluster, sq_eps))
 

@@ -119,16 +119,16 @@ def _has_neighbours(cells: Cells, cell: int, i: int, sq_eps: float, min_samples:
 
 
 @njit(cache=True, nogil=True)
-def find_cores(cells: Cells, sq_eps: float, min_samples: int) -> Flags:
-    """Return which points, in cell order, have min_samples neighbours within eps, themselves included."""
+def find_cores(cells: Cells, sq_eps: float, min_samples: Ints) -> Flags:
+    """Return which points, in cell order, have the min_samples of their cell within eps, themselves included."""
     core = np.zeros(cells.order.size, np.bool_)
     for cell in range(cells.first.size - 1):
         a, b = cells.first[cell], cells.first[cell + 1]
-        if b - a >= min_samples:
+        if b - a >= min_samples[cell]:
             core[a:b] = True
         else:
             for i in range(a, b):
-                core[i] = _has_neighbours(cells, cell, i, sq_eps, min_samples)
+                core[i] = _has_neighbours(cells, cell, i, sq_eps, min_samples[cell])
     return core
 
 

@@ -202,3 +202,45 @@ def join_open(point: Ints, cluster: Ints, is_core: Flags, is_owned: Flags) -> tu
     row = row[np.lexsort((first_core[whole[row]], point[row]))]
     row = row[np.append(True, np.diff(point[row]) != 0)]
     return row, whole[row]
+
+
+def split_chains(
+    lon_deg: Floats, lat_deg: Floats, cluster: Ints, pass_code: Ints, *, eps_m: float, min_samples: int, share: float
+) -> Ints:
+    """Cluster the members of each cluster anew with a core rule that follows the passes behind it.
+
+    The more passes, the more far-out detections: with a fixed core rule three of them bridge two signs of a class, and
+    clusters grow into chains as fleets do. A sign that many passes report has a core of many. So a cluster of P passes
+    is clustered again, by itself, with max(min_samples, share P) for a core; what is left over is noise. A cluster is
+    known whole by then, so that tiles do not show in this either.
+
+    Parameters
+    ----------
+    lon_deg, lat_deg, pass_code
+        (n,) members, sorted by cluster, pass and track.
+    cluster
+        (n,) their clusters.
+    eps_m, min_samples
+        Those of the clusters.
+    share
+        Passes of a cluster that make a core, 0 … 1.
+
+    Returns
+    -------
+    (n,) clusters numbered anew, -1 for noise.
+    """
+    is_first = np.append(True, np.diff(cluster) != 0)
+    group = np.cumsum(is_first) - 1
+    is_pass = is_first | np.append(True, np.diff(pass_code) != 0)
+    n_passes = np.bincount(group[is_pass])
+    least = np.maximum(min_samples, np.ceil(share * n_passes)).astype(np.int64)
+    again = least[group] > min_samples
+    if not again.any():
+        return group
+    lon0, lat0 = lon_deg[is_first], lat_deg[is_first]
+    ecef = ecef_points(lon_deg[again], lat_deg[again])
+    plane = tile_planes(ecef, group[again], ecef_points(lon0, lat0), local_axes(lon0, lat0))
+    found = dbscan_groups(plane, group[again], eps_m=eps_m, min_samples=least, ecef_m=ecef)
+    split = group.copy()
+    split[again] = np.where(found.labels < 0, -1, found.labels + len(n_passes))
+    return split

@@ -6,17 +6,18 @@ A cluster leaves as one entry in each of a dictionary of equally long columns, `
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from geofleet.algorithms.clustering_kernels import radix_argsort
 from geofleet.algorithms.fusion import fuse, hash_members, information_weights, move_to_members, vote
-from geofleet.algorithms.tiling import cluster_tiles, join_open, quadkey_bounds
+from geofleet.algorithms.tiling import cluster_tiles, join_open, quadkey_bounds, split_chains
 from geofleet.tables.dealt import read_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     Columns = dict[str, NDArray[Any]]
     Flags = NDArray[np.bool_]
     Ints = NDArray[np.int64]
+    Splitter = Callable[..., Ints]
 
 
 _FUSED = frozenset(
@@ -44,6 +46,7 @@ class TileTask:
     runs: tuple[int, ...]
     eps_m: float
     min_samples: int
+    min_samples_share: float
     semantic: str
 
 
@@ -73,11 +76,16 @@ def cluster_batch(task: TileTask) -> TileResult:
     )
     open_rows = {name: values[found.open_row] for name, values in rows.items()}
     open_rows |= {"cluster": found.open_cluster, "is_core": found.open_is_core}
-    return TileResult(fuse_members(rows, found.closed_row, found.closed_cluster), open_rows)
+    return TileResult(fuse_members(rows, found.closed_row, found.closed_cluster, splitter=splitter(task)), open_rows)
 
 
-def fuse_open(parts: Sequence[Columns]) -> Columns:
-    """Join the open clusters of all batches and fuse them."""
+def splitter(task: TileTask) -> Splitter:
+    """Return `split_chains` with the settings of a task."""
+    return partial(split_chains, eps_m=task.eps_m, min_samples=task.min_samples, share=task.min_samples_share)
+
+
+def fuse_open(parts: Sequence[Columns], split: Splitter | None = None) -> Columns:
+    """Join the open clusters of all batches, split chains as in closed ones, and fuse them."""
     n_before = 0
     numbered = []
     for part in parts:
@@ -92,11 +100,17 @@ def fuse_open(parts: Sequence[Columns]) -> Columns:
     point = np.empty(len(order), np.int64)
     point[order] = np.cumsum(is_new)
     row, cluster = join_open(point, rows["cluster"], rows["is_core"], rows["is_owned"])
-    return fuse_members(rows, row, cluster)
+    return fuse_members(rows, row, cluster, splitter=split)
 
 
 def fuse_members(
-    rows: Columns, member: Ints, cluster: Ints, *, is_weighted: bool = True, is_medoid: Flags | None = None
+    rows: Columns,
+    member: Ints,
+    cluster: Ints,
+    *,
+    splitter: Splitter | None = None,
+    is_weighted: bool = True,
+    is_medoid: Flags | None = None,
 ) -> Columns:
     """Return one row a cluster; members are put in the order of their keys first.
 
@@ -106,6 +120,8 @@ def fuse_members(
         Detections, one array a column.
     member, cluster
         (n,) the rows that are in clusters, and the cluster of each.
+    splitter
+        What clusters members anew within their clusters; None to leave them.
     is_weighted
         Whether centroids are weighted by information, or plain means.
     is_medoid
@@ -114,9 +130,14 @@ def fuse_members(
     if cluster.size == 0:
         return {}
     order = _key_order(rows["track_id"][member], rows["pass_code"][member], cluster)
-    taken = member[order]
+    taken, cluster = member[order], cluster[order]
+    if splitter:
+        cluster = splitter(rows["lon"][taken], rows["lat"][taken], cluster, rows["pass_code"][taken])
+        kept = np.flatnonzero(cluster >= 0)
+        kept = kept[radix_argsort(cluster[kept], np.arange(kept.size))]  # stable: in a cluster they stay by key
+        taken, cluster = taken[kept], cluster[kept]
     rows = {name: values[taken] for name, values in rows.items() if name in _FUSED}
-    first = np.append(np.flatnonzero(np.diff(cluster[order], prepend=-1)), cluster.size)
+    first = np.append(np.flatnonzero(np.diff(cluster, prepend=-1)), cluster.size)
     lead = first[:-1]
     weight = information_weights(rows["var_m2"]) if is_weighted else np.ones(cluster.size)
     fused = fuse(rows["lon"], rows["lat"], weight=weight, pass_code=rows["pass_code"], first=first)
@@ -149,6 +170,6 @@ def _key_order(track_id: Ints, pass_code: Ints, cluster: Ints) -> Ints:
 
 
 def concatenate(parts: Sequence[Columns]) -> Columns:
-    """Stack columns; parts without any are skipped."""
+    """Stack columns, taking them out of the parts: what is stacked is not held twice. Parts without any are skipped."""
     parts = [part for part in parts if part]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
+    return {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])} if parts else {}

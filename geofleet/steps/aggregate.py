@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from geofleet.algorithms.tiling import halo_m
-from geofleet.engines.batches import TileTask, cluster_batch, concatenate, fuse_open
+from geofleet.engines.batches import TileTask, cluster_batch, concatenate, fuse_open, splitter
 from geofleet.engines.local import run_tasks
 from geofleet.engines.whole import RunTask, cluster_run
 from geofleet.errors import ConfigError
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     Columns = dict[str, NDArray[Any]]
     Ints = NDArray[np.int64]
 
-BATCH_ROWS = 200_000  # detections that one thread clusters at a time: tens of megabytes
-DUCKDB_MEMORY = "400MB"  # what its joins and groups may hold before they spill
+BATCH_ROWS = 100_000  # detections that one thread clusters at a time: tens of megabytes
+DUCKDB_MEMORY = "250MB"  # what its joins and groups may hold before they spill
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,13 +136,13 @@ def aggregate(
         staged = _stage(detections, Path(folder), settings, n_vehicles=n_vehicles, passes=passes, n_workers=n_workers)
         method = settings.method
         if method == "dbscan":
-            results = list(
-                run_tasks(cluster_batch, _tile_tasks(staged, settings), n_workers=n_workers, progress=progress)
-            )
-            clusters = concatenate([*(r.clusters for r in results), fuse_open([r.open_rows for r in results])])
+            tasks = _tile_tasks(staged, settings)
+            results = list(run_tasks(cluster_batch, tasks, n_workers=n_workers, progress=progress))
+            crossing = fuse_open([r.open_rows for r in results], splitter(tasks[0]) if tasks else None)
+            clusters = concatenate([*(r.clusters for r in results), crossing])
         else:
-            tasks = _run_tasks(staged, settings, method, counts)
-            clusters = concatenate(list(run_tasks(cluster_run, tasks, n_workers=1, progress=progress)))
+            whole = _run_tasks(staged, settings, method, counts)
+            clusters = concatenate(list(run_tasks(cluster_run, whole, n_workers=1, progress=progress)))
     fleet = {run_id: n_vehicles or reporting for run_id, reporting in staged.fleet.items()}
     if driven and clusters:
         clusters["n_opportunities"] = _opportunities(clusters, driven, sorted(fleet), n_vehicles)
@@ -225,6 +225,7 @@ def _tile_tasks(staged: Staged, settings: AggregateConfig) -> list[TileTask]:
             runs=tuple(runs[start:stop]),
             eps_m=settings.eps_m,
             min_samples=settings.min_samples,
+            min_samples_share=settings.min_samples_share,
             semantic=settings.semantic,
         )
         for number, start, stop in zip(numbers.tolist(), starts.tolist(), stops.tolist(), strict=True)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 FINE_ZOOM = 18  # cells of 100 m at 50 degrees: hot tiles are split down to these
 _CELL_M = 3_400_000.0  # a cell of zoom 0 at 85.05 degrees is at least this wide
+MAX_BATCHES = 500  # files that are written by turns
 BLOCK_ROWS = 250_000  # rows that are sorted into their batches at a time
 _MAX_ID_BITS = 1 << 29  # 64 MB of track ids
 NEVER_BEGUN, NEVER_ENDED = np.iinfo(np.int64).max, np.iinfo(np.int64).min  # times that are missing, µs
@@ -63,7 +64,8 @@ def stage_detections(
     zoom, halo_m
         Size of the tiles, and the margin that each reads, metres.
     batch_rows
-        Detections that the tiles of a batch own; a tile that owns more is split.
+        Detections that the tiles of a batch own, or more where there would be over MAX_BATCHES; a tile that owns more
+        is split.
     n_vehicles
         Use the first so many of every run; 0 for all.
     passes, correct_bias
@@ -81,6 +83,8 @@ def stage_detections(
     bind_table(connection, DETECTIONS, detections, is_filled=True)
     create_view(connection, "aggregate/judged")
     _report_passes(connection)
+    n_rows, n_usable = connection.table("reporting").aggregate("sum(n_rows), sum(n_usable)").fetchall()[0]
+    batch_rows = max(batch_rows, (n_usable or 0) // MAX_BATCHES)
     materialise(connection, "aggregate/fleet", {"n_vehicles": n_vehicles})
     materialise(connection, "aggregate/passes")
     create_view(connection, "aggregate/usable")
@@ -97,7 +101,6 @@ def stage_detections(
     materialise(connection, "tiles/assign", {"batch_rows": batch_rows})
     _deal(connection, folder, fine_zoom=fine_zoom, halo_m=halo_m)
     fleet = connection.table("fleet").to_arrow_table()
-    n_rows, n_usable = connection.table("reporting").aggregate("sum(n_rows), sum(n_usable)").fetchall()[0]
     return Staged(
         folder=folder,
         tiles=connection.table("assign").to_arrow_table(),

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from pyproj import Geod
 from sklearn.cluster import DBSCAN
 
+from geofleet.algorithms.clustering import dbscan
 from geofleet.algorithms.fusion import fuse, information_weights, name_hashes, vote
 from geofleet.algorithms.geodesy import EnuFrame
-from geofleet.algorithms.tiling import cluster_tiles, halo_m, join_open, quadkey_bounds, quadkeys
+from geofleet.algorithms.tiling import cluster_tiles, halo_m, join_open, quadkey_bounds, quadkeys, split_chains
 from geofleet.errors import InputError
 from geofleet.tables.database import connect
 
@@ -225,3 +226,32 @@ def test_colliding_ids_are_told_apart():
     names = [name.decode() for name in name_hashes(hashes).tolist()]
     assert names == ["f000000000000", "fabcdef012345", "fabcdef012345-2", "fabcdef012346"]
     assert name_hashes(hashes[:0]).size == 0
+
+
+def chain(rng, n_passes, gap_m=13.0):
+    """Two signs of a class whose far-out detections meet between them."""
+    xy = np.concatenate([rng.normal((at, 0), 1.7, (n_passes, 2)) for at in (0.0, gap_m)])
+    lon, lat = EnuFrame(24.9, 60.2).to_lonlat(xy)
+    pass_code = np.tile(np.arange(n_passes), 2)
+    order = np.argsort(pass_code, kind="stable")
+    return xy[order], lon[order], lat[order], pass_code[order]
+
+
+def test_a_core_rule_that_follows_the_passes_splits_what_a_fixed_one_chains():
+    xy, lon, lat, pass_code = chain(np.random.default_rng(0), 600)
+    assert dbscan(xy, 4.0, 3).max() == 0  # one chain
+    one = np.zeros(len(lon), np.int64)
+    split = split_chains(lon, lat, one, pass_code, eps_m=4.0, min_samples=3, share=0.5)
+    assert set(split.tolist()) - {-1} == {1, 2}
+    for label in (1, 2):
+        assert len(set((xy[split == label, 0] > 6.5).tolist())) == 1  # all of it on one side
+    expected = dbscan(xy, 4.0, 300)  # half of 600 passes
+    assert ((split < 0) == (expected < 0)).all()
+    assert len(np.unique(np.column_stack((split, expected)), axis=0)) == len(np.unique(split))
+
+
+def test_few_passes_leave_clusters_as_they_are():
+    _, lon, lat, pass_code = chain(np.random.default_rng(0), 20)
+    clusters = np.repeat([4, 9], 20)
+    same = split_chains(lon, lat, clusters, pass_code, eps_m=4.0, min_samples=3, share=0.1)
+    assert same.tolist() == np.repeat([0, 1], 20).tolist()
