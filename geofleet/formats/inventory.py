@@ -18,7 +18,7 @@ from geofleet.formats.datum import datum_of
 from geofleet.formats.inventory_codes import OSM, guess_country, is_osm, read_codes, read_osm, scheme_of
 from geofleet.formats.inventory_columns import choose_columns, numbers, parse_facings, parse_times, read_options, texts
 from geofleet.formats.inventory_files import detect, read_features
-from geofleet.formats.inventory_layer import is_own_layer, own_layer
+from geofleet.formats.inventory_layer import is_own_layer, own_lanes, own_layer
 from geofleet.formats.inventory_places import Places, place_features
 from geofleet.formats.positions import area_doubt, country_at, doubts
 from geofleet.formats.reading import LayerRead
@@ -35,10 +35,13 @@ if TYPE_CHECKING:
     from geofleet.formats.inventory_columns import InventoryColumns
     from geofleet.formats.inventory_files import Features
 
-__all__ = ["detect", "read_signs"]
+__all__ = ["detect", "read_lanes", "read_signs"]
 
 FORMAT = "inventory"
 OPTIONS = frozenset({"crs", "scheme", "country", "separator", "day_first", "layer", "encoding", "delimiter", "swap_xy"})
+_TEXTS = tuple(column.name for column in SIGNS.columns if not column.nullable)
+_NO_PLACES = (np.zeros(0), np.zeros(0))
+_OSM_STARTS = ("traffic_sign", "maxspeed", "road_marking")
 _OSM_KEYS = ("direction", "highway", "city_limit", "traffic_signals:direction")
 
 
@@ -91,8 +94,22 @@ def read_signs(path: Path, *, columns: Mapping[str, str] | Path | None = None, *
         return _read(path, features, named, options)
 
 
+def read_lanes(path: Path) -> LayerRead:
+    """Read roads and lanes back that geofleet wrote as GeoJSON, GeoPackage or FlatGeobuf.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged or of another format, or holds something else.
+    """
+    with explained(path):
+        return own_lanes(path, read_features(path))
+
+
 def _read(path: Path, features: Features, named: Mapping[str, str], options: Mapping[str, Any]) -> LayerRead:
     """Return the signs of the rows of a file."""
+    if not features.table.num_rows and not named:
+        return LayerRead(build_table(SIGNS, {name: [] for name in _TEXTS}, _NO_PLACES), features.file_format)
     chosen, guessed = choose_columns(features.table.column_names, named, has_geometry=features.geometry is not None)
     if not chosen.code:
         raise InputError(
@@ -101,6 +118,13 @@ def _read(path: Path, features: Features, named: Mapping[str, str], options: Map
             todo='Name it: columns={"code": …}.',
         )
     places = place_features(path, features, chosen, crs=options.get("crs"), swap_xy=bool(options.get("swap_xy")))
+    if features.table.num_rows and not len(places.feature):
+        reasons = ", ".join(f"{n} {reason}" for reason, n in places.skipped.items())
+        raise InputError(
+            f"none of {features.table.num_rows} rows has a position that can be used ({reasons}).",
+            where=str(path),
+            todo="Give degrees or metres as plain numbers, and name columns and CRS: --columns x=…,y=… --crs …",
+        )
     table = features.table.take(places.feature)
     plates, told = _plates(table, chosen, places, options)
     found = features.found | places.found | told
@@ -154,7 +178,7 @@ def _plates(
 
 def _osm_tags(table: pa.Table, chosen: InventoryColumns) -> list[dict[str, str]]:
     """Return the tags of every row that say something about its signs."""
-    names = [n for n in table.column_names if n.startswith(("traffic_sign", "maxspeed")) or n in _OSM_KEYS]
+    names = [n for n in table.column_names if n.startswith(_OSM_STARTS) or n in _OSM_KEYS]
     columns = {name: texts(table, name) for name in names} | {"traffic_sign": texts(table, chosen.code)}
     rows = zip(*columns.values(), strict=True)
     return [{name: value for name, value in zip(columns, row, strict=True) if value} for row in rows]

@@ -69,14 +69,14 @@ class InventoryColumns:
 # What people call these columns, most telling first; compared in lower case, letters and digits only
 _NAMES = {
     "code": "rawcode trafficsigncode trafficsign signcode code osmtrafficsign objectvalue mutcdcode mutcd bordkode "
-    "bordcode rvvcode verkehrszeichen vznummer vznr zeichen codepanneau panneau merkkikoodi signtype signclass value "
-    "class type",
+    "bordcode rvvcode verkehrszeichen vznummer vznr zeichen codepanneau panneau merkkikoodi signtype signclass "
+    "sign schild zeichennummer stvo value class type",
     "value": "signvalue textonsign opschrift speedlimit maxspeed extratext",
     "sign_id": "signid id osmid objectid gid fid uuid ogcfid featureid",
     "facing": "facingdeg facing direction azimuth bearing orientation compassangle kijkrichting richtung heading",
     "country": "country countrycode isocountry",
-    "x": "lon longitude lng long x easting xcoord coordx locatiex pointx rechtswert",
-    "y": "lat latitude y northing ycoord coordy locatiey pointy hochwert",
+    "x": "lon longitude lng long längengrad laengengrad länge x easting xcoord coordx locatiex pointx rechtswert",
+    "y": "lat latitude breitengrad breite y northing ycoord coordy locatiey pointy hochwert",
     "geometry": "wkt geom geometry thegeom wktgeom shape",
     "first_seen": "firstseen firstseenat dateinstalled installdate installed placedat",
     "last_seen": "lastseen lastseenat lastinspected inspectiondate",

@@ -41,6 +41,7 @@ _OPEN_OPTIONS = {"geojson": {"DATE_AS_STRING": "YES"}, "geojsonseq": {"DATE_AS_S
 _MAX_UNPACKED_BYTES = 4 << 30
 _CSV_BLOCK_BYTES = 16 << 20
 _DELIMITERS = ";\t|,"
+_SEPARATOR = re.compile(r'"?sep=.')
 _AGAIN = "Fetch or export it again."
 
 
@@ -288,7 +289,7 @@ def _read_csv(path: Path, encoding: str | None, delimiter: str | None) -> Featur
     from pyarrow import csv as arrow_csv  # noqa: PLC0415  (only CSV needs it)
 
     encoding, notes = (encoding, {}) if encoding else _encoding(path)
-    names, delimiter = _header(path, encoding, delimiter)
+    names, delimiter, n_before = _header(path, encoding, delimiter)
     bad: list[int] = []
 
     def count(row: Any) -> str:
@@ -298,7 +299,9 @@ def _read_csv(path: Path, encoding: str | None, delimiter: str | None) -> Featur
 
     table = arrow_csv.read_csv(
         path,
-        read_options=arrow_csv.ReadOptions(encoding=encoding, block_size=_CSV_BLOCK_BYTES, use_threads=False),
+        read_options=arrow_csv.ReadOptions(
+            encoding=encoding, block_size=_CSV_BLOCK_BYTES, use_threads=False, skip_rows=n_before
+        ),
         parse_options=arrow_csv.ParseOptions(delimiter=delimiter, newlines_in_values=True, invalid_row_handler=count),
         # Text, all of it: as numbers 274.10 and 0205 would lose what tells them apart
         convert_options=arrow_csv.ConvertOptions(column_types=dict.fromkeys(names, pa.string())),
@@ -327,11 +330,18 @@ def _chunks(path: Path) -> Iterator[bytes]:
             yield chunk
 
 
-def _header(path: Path, encoding: str, delimiter: str | None) -> tuple[list[str], str]:
-    """Return the column names and what stands between them."""
+def _header(path: Path, encoding: str, delimiter: str | None) -> tuple[list[str], str, int]:
+    """Return the column names, what stands between them, and how many lines come before.
+
+    Those are comments (`#`), and the line by which a spreadsheet names the separator (`sep=;`).
+    """
+    n_before = 0
     try:
         with path.open(encoding="utf-8-sig" if encoding.lower() in {"utf-8", "utf8"} else encoding) as file:
             line = file.readline(1 << 16)
+            while line.startswith("#") or (_SEPARATOR.match(line) and not n_before):
+                n_before += 1
+                line = file.readline(1 << 16)
     except LookupError:
         raise ConfigError(f"unknown encoding {encoding!r}.", todo="Give one such as utf-8 or cp1252.") from None
     unquoted = re.sub(r'"[^"]*"', "", line)
@@ -344,4 +354,4 @@ def _header(path: Path, encoding: str, delimiter: str | None) -> tuple[list[str]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(f"columns {', '.join(twice)[:200]} are there twice.", where=str(path), todo="Rename them.")
-    return names, delimiter
+    return names, delimiter, n_before

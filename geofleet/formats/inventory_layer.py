@@ -1,4 +1,4 @@
-"""geofleet's own `signs` table back from GeoJSON, GeoPackage, FlatGeobuf or whatever it was exported to."""
+"""geofleet's own `signs` and `lanes` tables back from GeoJSON, GeoPackage, FlatGeobuf or another export."""
 
 from __future__ import annotations
 
@@ -14,21 +14,55 @@ from geofleet.formats.inventory_columns import numbers, parse_times, texts
 from geofleet.formats.inventory_files import CRS84
 from geofleet.formats.positions import to_lonlat
 from geofleet.formats.reading import LayerRead
-from geofleet.tables.schemas import SIGNS
+from geofleet.tables.schemas import LANES, SIGNS
 from geofleet.tables.store import build_table
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from geofleet.formats.inventory_files import Features
-    from geofleet.tables.schemas import Column
+    from geofleet.tables.schemas import Column, Schema
 
-_NAMES = tuple(column.name for column in SIGNS.columns if not column.nullable)
+_LINE = 1  # shapely.get_type_id
 
 
-def is_own_layer(table: pa.Table) -> bool:
-    """Tell whether a table has every column that a `signs` table must have."""
-    return set(_NAMES) <= set(table.column_names)
+def is_own_layer(table: pa.Table, schema: Schema = SIGNS) -> bool:
+    """Tell whether a table has every column that a `signs` table, or one of another schema, must have."""
+    return {column.name for column in schema.columns if not column.nullable} <= set(table.column_names)
+
+
+def own_lanes(path: Path, features: Features) -> LayerRead:
+    """Return a `lanes` table exported before, as it was.
+
+    Raises
+    ------
+    InputError
+        The file is none, or a geometry is no line.
+    """
+    geometry = features.geometry
+    if geometry is None or not is_own_layer(features.table, LANES):
+        raise InputError(
+            "holds no lanes.", where=str(path), todo="Give a map with roads, or lanes that geofleet wrote."
+        )
+    is_line = shapely.get_type_id(geometry) == _LINE
+    if not is_line.all():
+        raise InputError(
+            f"a layer of lanes, but {int((~is_line).sum())} of {len(is_line)} rows are no lines.",
+            where=str(path),
+            todo="Export it again.",
+        )
+    x, y = shapely.get_coordinates(geometry).T
+    crs = features.crs or CRS84
+    lon, lat = to_lonlat(x, y, crs, where=str(path))
+    if np.isnan(lon).any():
+        raise InputError(
+            f"{int(np.isnan(lon).sum())} positions are not valid.", where=str(path), todo="Export it again."
+        )
+    lines = shapely.set_coordinates(np.array(geometry, object), np.column_stack((lon, lat)))
+    names = features.table.column_names
+    columns = {c.name: _values(features.table, c) for c in LANES.all_columns if c.name in names}
+    lanes = build_table(LANES, columns, lines)
+    return LayerRead(lanes, features.file_format, features.skipped, features.found, datum_of(crs, lon, lat))
 
 
 def own_layer(path: Path, features: Features, crs: Any = None) -> LayerRead:

@@ -34,7 +34,6 @@ class LayerFormat:
 
     what: str
     module: str
-    has_lanes: bool = True
     sign_options: frozenset[str] = frozenset()
     lane_options: frozenset[str] = frozenset()
 
@@ -47,7 +46,7 @@ class LayerFormat:
 
     def options(self, schema: Schema) -> frozenset[str]:
         """Return the names of the options that the reader takes."""
-        if self.module == "inventory":
+        if self.module == "inventory" and schema is SIGNS:
             return frozenset({"columns", *import_module("geofleet.formats.inventory").OPTIONS})
         return self.sign_options if schema is SIGNS else self.lane_options
 
@@ -74,7 +73,6 @@ FORMATS: Mapping[str, LayerFormat] = MappingProxyType(
         _INVENTORY: LayerFormat(
             "a sign inventory (GeoJSON, GeoPackage, Shapefile, FlatGeobuf, GeoParquet, CSV)",
             "inventory",
-            has_lanes=False,
         ),
     }
 )
@@ -142,8 +140,6 @@ def read_layer(
         what = f"unknown format {found!r}" if found else "this format is not known"
         raise InputError(f"{what}.", where=str(path), todo=f"Supported are {SUPPORTED}.")
     layer = FORMATS[found]
-    if schema is LANES and not layer.has_lanes:
-        raise InputError(f"{layer.what} holds no {schema.name}.", where=str(path), todo="Give a map with roads.")
     given = {name: value for name, value in options.items() if value is not None}
     takes = layer.options(schema)
     foreign = sorted(set(given) - takes - {"roads"})  # roads are on by default, also where there are none

@@ -5,6 +5,7 @@ Files are PBF, or are made into one first, by libosmium, in a temporary folder: 
 
 from __future__ import annotations
 
+import codecs
 import re
 import tempfile
 from contextlib import contextmanager
@@ -25,10 +26,12 @@ from geofleet.formats.osm_tags import (
     tells_of_signs,
 )
 from geofleet.formats.reading import BZIP2, GZIP, read_head
+from geofleet.formats.xml import iter_elements
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    import osmium
     from numpy.typing import NDArray
 
     Ints = NDArray[np.int64]
@@ -37,6 +40,7 @@ _T = TypeVar("_T")
 _PBF_MARK = b"OSMHeader"
 _MARK_WITHIN = 1024
 _LANELET = re.compile(rb"""v=["']lanelet["']""")
+_DELETED = re.compile(rb"""action=["']delete["']""")
 _CHUNK, _OVERLAP = 1 << 20, 64
 _TAG_BYTES = 16  # two numbers
 _HIGHWAY = b"\n\x07highway"
@@ -87,6 +91,8 @@ def detect(head: bytes) -> str:
             return f"{'json' if osm_json.looks_like(inside) else 'osm'}{suffix}"
     if osm_json.looks_like(head):
         return "json"
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        head = head[: len(head) // 2 * 2].decode("utf-16", "replace").encode()
     return "osm" if b"<osm" in head[:_MARK_WITHIN] else ""
 
 
@@ -127,9 +133,24 @@ def _rewrite(path: Path, found: str, copy: Path) -> None:
             osm_json.write_elements(path, writer)
         else:
             try:
-                osmium.apply(osmium.io.File(str(path), found), writer)
+                _copy(path, found, writer)
             except osmium.InvalidLocationError as error:
                 raise ValueError(*error.args) from None
+
+
+def _copy(path: Path, found: str, writer: osmium.SimpleWriter) -> None:
+    """Write what a file of XML holds, without what an editor has marked as deleted."""
+    import osmium  # noqa: PLC0415  (as above)
+
+    source = osmium.io.File(str(path), found)
+    if found != "osm" or not _is_in(path, _DELETED):
+        osmium.apply(source, writer)
+        return
+    elements = iter_elements(path, ("node", "way", "relation"))
+    gone = {(e.tag[0], e.get("id", "")) for e in elements if e.get("action") == "delete"}
+    for item in osmium.FileProcessor(source):
+        if (item.type_str(), str(item.id)) not in gone:
+            writer.add(item)
 
 
 @contextmanager
@@ -156,16 +177,23 @@ def refuse_lanelet2(path: Path) -> None:
     InputError
         The file holds lanelets.
     """
+    if _is_in(path, _LANELET):
+        raise InputError(
+            "a Lanelet2 map, which is not read.",
+            where=str(path),
+            todo="Give an OpenStreetMap extract: .osm.pbf, .osm, .osm.gz or .osm.bz2.",
+        )
+
+
+def _is_in(path: Path, pattern: re.Pattern[bytes]) -> bool:
+    """Tell whether a file holds a short text, a piece at a time."""
     with path.open("rb") as file:
         tail = b""
         while chunk := file.read(_CHUNK):
-            if _LANELET.search(tail + chunk):
-                raise InputError(
-                    "a Lanelet2 map, which is not read.",
-                    where=str(path),
-                    todo="Give an OpenStreetMap extract: .osm.pbf, .osm, .osm.gz or .osm.bz2.",
-                )
+            if pattern.search(tail + chunk):
+                return True
             tail = chunk[-_OVERLAP:]
+    return False
 
 
 def sign_nodes(pbf: Path) -> SignNodes:

@@ -9,7 +9,7 @@ plates of the same pole.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 POINT_HIGHWAYS = {"stop": "stop", "give_way": "give_way", "traffic_signals": "traffic_signals"}
 _PLAIN_KEYS = frozenset({"highway", "direction", "city_limit", "traffic_signals:direction"})
-KEY_STARTS = ("traffic_sign", "max", *_PLAIN_KEYS)
+_PAINTED = "road_marking"  # `road_marking=traffic_sign`: what `traffic_sign` names is painted on the road
+KEY_STARTS = ("traffic_sign", "max", _PAINTED, *_PLAIN_KEYS)
 _SIDE = "forward|backward|both|left|right"
 _SIGN_KEY = re.compile(
     rf"traffic_sign(?::(?P<slot>\d{{1,3}}))?(?::(?P<side>{_SIDE}))?|traffic_sign:(?P<first>{_SIDE}):(?P<then>\d{{1,3}})"
@@ -147,7 +148,7 @@ def is_sign_key(key: str) -> bool:
 
 def tells_of_signs(key: str) -> bool:
     """Tell whether a tag can change what the signs of a node are, or where they face."""
-    return key in _PLAIN_KEYS or key.startswith(("traffic_sign:", "max"))
+    return key in _PLAIN_KEYS or key.startswith(("traffic_sign:", "max", _PAINTED))
 
 
 def tagged_signs(tags: Mapping[str, str]) -> list[TaggedSign]:
@@ -177,7 +178,8 @@ def _is_code(text: str) -> bool:
 def node_signs(tags: Mapping[str, str]) -> list[NodeSign]:
     """Return the signs of a node, in the order of their slots.
 
-    `highway=stop|give_way|traffic_signals` is a sign of its own when no `traffic_sign` key says so already.
+    `highway=stop|give_way|traffic_signals` is a sign of its own when no `traffic_sign` key says so already. Beside
+    `road_marking=traffic_sign`, of either direction, the signs are markings.
     """
     plates = tagged_signs(tags)
     meanings = [_meaning(plate, tags) for plate in plates]
@@ -185,6 +187,8 @@ def node_signs(tags: Mapping[str, str]) -> list[NodeSign]:
     if word and load_taxonomy().meaning(word).concept not in {meaning.concept for meaning in meanings}:
         plates.append(TaggedSign(word, "", plates[-1].slot + 1 if plates else 1, 0, follows=False, side=""))
         meanings.append(load_taxonomy().meaning(word))
+    if any(key.startswith(_PAINTED) and value == "traffic_sign" for key, value in tags.items()):
+        meanings = [replace(meaning, kind="marking") for meaning in meanings]
     kinds = [
         "plate" if plate.follows and not meaning.known else meaning.kind
         for plate, meaning in zip(plates, meanings, strict=True)

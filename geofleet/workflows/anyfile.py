@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from geofleet.errors import ConfigError, InputError
+from geofleet.errors import ConfigError, GeofleetError, InputError
 from geofleet.formats import layers
 from geofleet.formats.reading import LayerRead, read_head
 from geofleet.tables.schemas import DETECTIONS, DRIVES, LANES, SCHEMAS, SIGNS
@@ -116,7 +116,7 @@ def kind_of(path: Path) -> str:
 
 
 def _kind_of_rows(path: Path, *, is_drive: bool) -> str:
-    """Tell detections, drives and inventories apart by what their columns are called."""
+    """Tell detections, drives, lanes and inventories apart by what their columns are called."""
     from geofleet.formats.detection_columns import choose_columns  # noqa: PLC0415  (as above)
     from geofleet.formats.detection_files import read_batches  # noqa: PLC0415
 
@@ -124,11 +124,24 @@ def _kind_of_rows(path: Path, *, is_drive: bool) -> str:
         names = next(read_batches(path)).table.column_names
         chosen = choose_columns(names, {}, has_geometry=True)[0].keys()
     except (InputError, StopIteration):  # not a format that detections come in: its own reader will say more
-        return DRIVES.name if is_drive else SIGNS.name
+        return DRIVES.name if is_drive else LANES.name if _holds_lanes(path) else SIGNS.name
+    if {column.name for column in LANES.columns if not column.nullable} <= set(names):
+        return LANES.name
     if chosen & _OF_CODES:
         is_layer = set(SIGNS.key) <= set(names)
         return DETECTIONS.name if chosen & _OF_FLEETS and not is_layer else SIGNS.name
     return DRIVES.name if is_drive else SIGNS.name
+
+
+def _holds_lanes(path: Path) -> bool:
+    """Tell whether a file of a GIS is a `lanes` table written before."""
+    from geofleet.formats.inventory_files import read_features  # noqa: PLC0415  (as above)
+    from geofleet.formats.inventory_layer import is_own_layer  # noqa: PLC0415
+
+    try:
+        return is_own_layer(read_features(path).table, LANES)
+    except GeofleetError:  # its own reader will say more
+        return False
 
 
 def _read_drive(path: Path, options: Mapping[str, Any]) -> LayerRead:

@@ -147,7 +147,7 @@ def info(path: Path, *, table: str = "auto", **options: Any) -> FileInfo:
 def _lanes(path: Path, file_format: str, options: Mapping[str, Any]) -> tuple[dict[str, int], str]:
     """Return the lanes or roads of a map by kind; why there are none where they cannot be read."""
     form = FORMATS.get(file_format)
-    if form is None or not form.has_lanes or file_format == _OWN:
+    if form is None or file_format == _OWN:
         return {}, ""
     taken = {name: value for name, value in options.items() if name in form.options(LANES)}
     try:

@@ -607,3 +607,36 @@ def test_a_crs_that_is_not_for_the_place_is_told(tmp_path):
     path.write_text("id,x,y,code\n1,900000,900000,B1\n2,900100,900000,B1\n", encoding="utf-8")
     told = [name for name in read_signs(path, crs="EPSG:31370").found if name.startswith(SUSPICIOUS)]
     assert any("Belgium" in name for name in told)
+
+
+# ---- heads of tables, and empty ones ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# exported by a tool\n# in 2020\nid,lon,lat,code\n1,8.4,49.0,DE:205\n",
+        "sep=;\nid;lon;lat;code\n1;8,4;49,0;DE:205\n",
+        "ID;Längengrad;Breitengrad;Zeichen\n1;8,4;49,0;DE:205\n",
+        "id,lon,lat,sign\n1,8.4,49.0,DE:205\n",
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "cp1252"])
+def test_what_stands_before_and_in_the_header(tmp_path, text, encoding):
+    path = tmp_path / "signs.csv"
+    path.write_bytes(text.encode(encoding))
+    row = read_signs(path).table.to_pylist()[0]
+    assert (row["sign_class"], row["bbox"]["xmin"], row["bbox"]["ymin"]) == ("yield", 8.4, 49.0)
+
+
+def test_a_collection_without_features_is_an_empty_layer(tmp_path):
+    path = tmp_path / "empty.geojson"
+    path.write_text('{"type": "FeatureCollection", "features": []}', encoding="utf-8")
+    assert read_signs(path).table.num_rows == 0
+
+
+def test_a_table_whose_positions_cannot_be_read_is_refused(tmp_path):
+    path = tmp_path / "dms.csv"
+    path.write_text('id,lon,lat,code\n1,"8°24\'E","49°0\'N",DE:205\n', encoding="utf-8")
+    with pytest.raises(InputError, match="none of 1 rows has a position that can be used"):
+        read_signs(path)

@@ -267,3 +267,28 @@ def test_a_map_in_the_wrong_place_is_refused(tmp_path, lon, lat, message):
     body = "".join(node(i, lon, lat + i * 1e-4, traffic_sign="DE:206") for i in range(1, 8))
     with pytest.raises(InputError, match=message):
         read_signs(xml(tmp_path, body)).table.num_rows  # noqa: B018 - rows are read when asked for
+
+
+def test_what_an_editor_has_deleted_is_not_there(tmp_path):
+    body = node(1, 10.0, 50.0, traffic_sign="DE:205").replace("<node ", '<node action="delete" ')
+    body += node(-2, 10.1, 50.0, traffic_sign="DE:206").replace("<node ", '<node action="modify" ')
+    assert read_signs(xml(tmp_path, body)).table["support_id"].to_pylist() == ["n-2"]
+
+
+def test_utf_16_is_read_like_utf_8(tmp_path):
+    path = tmp_path / "map.osm"
+    text = HEAD.replace("UTF-8", "UTF-16") + node(1, 10.0, 50.0, traffic_sign="DE:205") + "</osm>"
+    path.write_bytes(text.encode("utf-16"))
+    assert read_signs(path).table["sign_class"].to_pylist() == ["yield"]
+
+
+@pytest.mark.parametrize("key", ["road_marking", "road_marking:forward"])
+def test_a_sign_painted_on_the_road_is_a_marking(tmp_path, key):
+    body = (
+        f'<node id="1" lat="50" lon="10"><tag k="{key}" v="traffic_sign"/><tag k="traffic_sign" v="DE:274[30]"/></node>'
+    )
+    assert read_signs(xml(tmp_path, body)).table.select(["kind", "sign_class"]).to_pylist() == [
+        {"kind": "marking", "sign_class": "speed_limit:30"}
+    ]
+    other = body.replace('v="traffic_sign"/><tag', 'v="through"/><tag')
+    assert read_signs(xml(tmp_path, other, "b.osm")).table["kind"].to_pylist() == ["main"]

@@ -19,8 +19,9 @@ from geofleet.errors import ConfigError, InputError
 from geofleet.formats.layers import read_layer
 from geofleet.steps.evaluate import evaluate
 from geofleet.tables.schemas import LANES, SIGNS
-from geofleet.tables.store import build_table, lonlat, write_table
+from geofleet.tables.store import build_table, lonlat, read_table, write_table
 from geofleet.taxonomy import load_taxonomy
+from geofleet.workflows.anyfile import read_any
 from geofleet.workflows.convert import convert
 
 SUFFIXES = (".parquet", ".geojson", ".gpkg", ".fgb", ".osm", ".osc")
@@ -157,3 +158,20 @@ def test_a_gis_layer_keeps_the_code_of_a_vehicle_in_any_script(make_signs, tmp_p
     for suffix in SUFFIXES:
         convert(tmp_path / "in.parquet", tmp_path / f"out{suffix}")
         assert read_layer(tmp_path / f"out{suffix}").table["raw_code"].to_pylist() == ["とまれ <&>\"'"]
+
+
+@pytest.mark.parametrize("suffix", [".geojson", ".gpkg", ".fgb"])
+def test_lanes_come_back_from_a_gis_format(repo, suffix, tmp_path):
+    source = repo / "data" / "raw" / "helsinki.osm.pbf"
+    before, after = (tmp_path / name for name in (f"lanes{suffix}", "lanes.parquet"))
+    convert(source, before, table="lanes")
+    assert convert(before, after, table="lanes").n_rows > 100
+    assert read_table(LANES, after).equals(read_layer(source, LANES).table)
+    assert read_any(before)[0] is LANES
+
+
+def test_signs_are_no_lanes(repo, tmp_path):
+    signs = tmp_path / "signs.geojson"
+    convert(repo / "data" / "raw" / "helsinki.osm.pbf", signs)
+    with pytest.raises(InputError, match="holds no lanes"):
+        convert(signs, tmp_path / "lanes.parquet", table="lanes")
