@@ -29,6 +29,8 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Rate = Annotated[float, Field(ge=0, le=1)]
+LEAST_SPACING_M, MOST_FRAMES_HZ, MOST_RANGE_M, MOST_PER_KM = 0.01, 1000, 10_000, 10_000
+"""Beyond these a key is a slip of the pen, and a run would fill the memory before anyone noticed."""
 ROOT_SCENARIO = "paper"
 MIXED = "mixed"
 
@@ -56,16 +58,16 @@ class SceneConfig(_Section):
     """Which signs a study simulates and scores."""
 
     corridor_m: Positive
-    groups: tuple[str, ...]
+    groups: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1)]
     respect_facing: Annotated[bool, Off(value=False)]
-    billboards_per_km: Annotated[NonNegative, Off(0.0)]
+    billboards_per_km: Annotated[float, Field(ge=0, le=MOST_PER_KM), Off(0.0)]
     billboard_share: Annotated[tuple[Rate, Rate], Off((0.3, 0.6))]
 
 
 class FleetConfig(_Section):
     """How vehicles follow the drive."""
 
-    frame_spacing_m: Positive
+    frame_spacing_m: Annotated[float, Field(ge=LEAST_SPACING_M, allow_inf_nan=False)]
     heading_baseline_m: Positive
     speed_mps: Positive
     lateral_sigma_m: NonNegative
@@ -75,7 +77,7 @@ class FleetConfig(_Section):
     drives: Annotated[Literal["one", "all"], Off("one")]
     direction: Annotated[Literal["forward", "backward", "both"], Off("forward")]
     opposite_lane_m: Annotated[Finite, Off(3.5)]
-    frame_rate_hz: Annotated[NonNegative, Off(0.0)]
+    frame_rate_hz: Annotated[float, Field(ge=0, le=MOST_FRAMES_HZ), Off(0.0)]
     speed_profile: Annotated[Literal["constant", "recorded"], Off("constant")]
 
 
@@ -83,7 +85,7 @@ class SensorConfig(_Section):
     """What a camera sees and how wrong it is (paper, "Detection Simulation")."""
 
     sensor_kind: str
-    range_m: Positive
+    range_m: Annotated[float, Field(gt=0, le=MOST_RANGE_M)]
     fov_deg: Annotated[float, Field(gt=0, le=360)]
     gnss_sigma_m: NonNegative
     heading_sigma_deg: NonNegative
@@ -97,7 +99,7 @@ class SensorConfig(_Section):
     ghost_rate_per_ha: NonNegative
     gnss_drift_sigma_m: Annotated[NonNegative, Off(0.0)]
     gnss_drift_correlation_s: Annotated[Positive, Off(60.0)]
-    wrong_fixes_per_km: Annotated[NonNegative, Off(0.0)]
+    wrong_fixes_per_km: Annotated[float, Field(ge=0, le=MOST_PER_KM), Off(0.0)]
     wrong_fix_length_m: Annotated[Positive, Off(50.0)]
     wrong_fix_sigma_m: Annotated[NonNegative, Off(10.0)]
     fade_range_m: Annotated[NonNegative, Off(0.0)]
@@ -111,7 +113,7 @@ class SensorConfig(_Section):
     range_bias_drift_sigma_m: Annotated[NonNegative, Off(0.0)]
     bearing_bias_drift_sigma_deg: Annotated[NonNegative, Off(0.0)]
     bias_drift_correlation_s: Annotated[Positive, Off(60.0)]
-    ghost_tracks_per_km: Annotated[NonNegative, Off(0.0)]
+    ghost_tracks_per_km: Annotated[float, Field(ge=0, le=MOST_PER_KM), Off(0.0)]
     ghost_track_frames: Annotated[float, Field(ge=1, allow_inf_nan=False), Off(8.0)]
     declares: Annotated[Literal["own", "fleet"], Off("own")]
     declared_sigma_scale: Annotated[Positive, Off(1.0)]

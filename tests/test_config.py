@@ -57,6 +57,10 @@ def test_digest_changes_with_what_it_covers_only():
         (["gnss_sigma_m=nan"], r"sensor\.gnss_sigma_m"),
         (["false_negative_rate=1.2"], r"sensor\.false_negative_rate"),
         (["tracker=magic"], r"tracking\.tracker"),
+        (["groups=[]"], r"scene\.groups: .*at least 1"),
+        (["range_m=1e9"], r"sensor\.range_m: .*less than or equal to 10000"),
+        (["frame_spacing_m=1e-9"], r"fleet\.frame_spacing_m: .*greater than or equal to 0\.01"),
+        (["send_information=maybe"], r"tracking\.send_information"),
         (["nothing"], "'nothing' is not key=value"),
     ],
 )

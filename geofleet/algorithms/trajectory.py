@@ -107,7 +107,8 @@ def drive_line(xy_m: Floats, segment: Ints, elapsed_s: Floats | None = None) -> 
     times = None if elapsed_s is None else elapsed_s[kept][~lonely]
     if len(points) < 2:  # noqa: PLR2004 - a heading needs two points
         raise InputError(
-            f"the drive of {len(xy_m)} epochs has no motion: no two of a segment are {MOVING_STEP_M} m apart.",
+            f"the drive of {len(xy_m)} epoch{'s' if len(xy_m) > 1 else ''} has no motion: no two of a segment are "
+            f"{MOVING_STEP_M} m apart.",
             todo="Give a drive that moves.",
         )
     steps = np.hypot(*np.diff(points, axis=0).T)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
+MOST_GHOSTS_A_FRAME = 1000
 _NOT_OF_THE_MODEL = {"sensor_kind", "confusion", "confusion_in_group", "declares", "declared_sigma_scale"}
 
 
@@ -177,6 +178,13 @@ def _sensor_kinds(config: Config) -> list[tuple[float, SensorConfig]]:
                 f"occluded_share = {share:g} needs episodes of {share / (1 - share):.3g} frames or more, and "
                 f"occlusion_frames is {frames:g}.",
                 todo="Set occlusion_frames higher.",
+            )
+        cone_ha = sensor.range_m**2 * np.deg2rad(sensor.fov_deg) / 2e4
+        if sensor.ghost_rate_per_ha * cone_ha > MOST_GHOSTS_A_FRAME:
+            raise ConfigError(
+                f"ghost_rate_per_ha = {sensor.ghost_rate_per_ha:g} over a view cone of {cone_ha:.3g} ha makes "
+                f"{sensor.ghost_rate_per_ha * cone_ha:.3g} ghosts a frame, more than {MOST_GHOSTS_A_FRAME}.",
+                todo="Set ghost_rate_per_ha lower: the paper's 2 % is 0.02.",
             )
     return kinds
 

@@ -149,6 +149,8 @@ def test_what_cannot_be_is_refused_before_anything_is_simulated(signs, tmp_path)
     drive = write_drives(tmp_path / "drive.parquet", straight(), is_timed=False)
     with pytest.raises(InputError, match="no times to take the speed from"):
         run(signs, drive, tmp_path / "out", speed_profile="recorded")
+    with pytest.raises(ConfigError, match=r"over a view cone of 0\.524 ha makes 5\.24e\+03 ghosts a frame"):
+        run(signs, drive, tmp_path / "out", ghost_rate_per_ha=1e4)
     with pytest.raises(ConfigError, match="needs episodes of 9 frames or more"):
         run(signs, drive, tmp_path / "out", occluded_share=0.9)
     assert not (tmp_path / "out").exists()
