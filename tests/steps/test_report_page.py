@@ -147,6 +147,8 @@ def test_both_axes_have_one_scale_also_in_a_narrow_window(browser):
     wait(lambda: ranges(browser)[4] < 700)
     wait(lambda: abs(metres_a_pixel(browser)[0] / metres_a_pixel(browser)[1] - 1) < 0.01)
     assert browser.execute_script("return document.documentElement.scrollWidth") <= 700  # nothing sticks out
+    browser.execute_script(f"Bokeh.index.get_one({MAP}).reset()")
+    wait(lambda: abs(metres_a_pixel(browser)[0] / metres_a_pixel(browser)[1] - 1) < 0.01)
     browser.set_window_size(1280, 900)
     wait(lambda: ranges(browser)[4] > 900)
     browser.execute_script("document.getElementById('map').scrollIntoView({behavior: 'instant'})")

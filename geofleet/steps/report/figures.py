@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
@@ -92,7 +93,8 @@ def _figure(contents: Contents, width: float, height: float) -> Figure:
         notes.append("The drive is derived from the road graph.")
     if contents.is_from_osm:
         notes.append(OSM_NOTICE)
-    figure.supxlabel(" ".join(notes), fontsize=6.5, color="#555555", x=0.995, ha="right")
+    lines = textwrap.wrap(" ".join(notes), width=int(16 * width))
+    figure.supxlabel("\n".join(lines), fontsize=6.5, color="#555555", x=0.995, ha="right")
     return figure
 
 

@@ -39,27 +39,30 @@ sign @sign · tile @tile<br>distance @distance<br>@evidence</div>
 """
 # Keeps both axes at one scale when the window changes its width.
 _KEEP_SCALE = """
-const frame = cb_obj
-if (frame.inner_width > 0 && frame.inner_height > 0) {
+const [width, height] = [plot.inner_width, plot.inner_height]
+if (width > 0 && height > 0) {
   const middle = (x.start + x.end) / 2
-  const half = (y.end - y.start) * frame.inner_width / frame.inner_height / 2
+  const half = (y.end - y.start) * width / height / 2
   x.setv({start: middle - half, end: middle + half})
 }
 """
-# Shows everything again, at one scale.
+# Shows everything, at one scale: at first, which is when the figure gets its width, and on reset.
 _SHOW_ALL = """
-const need = Math.max((high[0] - low[0]) / plot.inner_width, (high[1] - low[1]) / plot.inner_height)
-const [e, n] = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2]
-const [w, h] = [need * plot.inner_width / 2, need * plot.inner_height / 2]
-plot.x_range.setv({start: e - w, end: e + w})
-plot.y_range.setv({start: n - h, end: n + h})
+const [width, height] = [plot.inner_width, plot.inner_height]
+if (width > 0 && height > 0) {
+  const scale = Math.max((high[0] - low[0]) / width, (high[1] - low[1]) / height) / 2
+  const [east, north] = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2]
+  x.setv({start: east - scale * width, end: east + scale * width})
+  y.setv({start: north - scale * height, end: north + scale * height})
+  plot.tags = ["laid out"]
+}
 """
+_ON_WIDTH = f"if (plot.tags.length) {{ {_KEEP_SCALE} }} else {{ {_SHOW_ALL} }}"
 
 
 def draw_map(scene: Scene) -> Model:
     """Draw roads, drive, tiles, both layers of signs, outcomes and error ellipses; the legend switches each."""
-    from bokeh.events import DocumentReady, Reset  # noqa: PLC0415  (a second of import that only the report needs)
-    from bokeh.models import CustomJS, Range1d, WheelZoomTool  # noqa: PLC0415
+    from bokeh.models import Range1d, WheelZoomTool  # noqa: PLC0415  (a second of import that only the report needs)
     from bokeh.plotting import figure  # noqa: PLC0415
 
     low, high = scene.extent
@@ -81,11 +84,19 @@ def draw_map(scene: Scene) -> Model:
     plot.legend.click_policy = "hide"
     plot.legend.location = "top_right"
     plot.legend.title = "click to show or hide"
-    plot.js_on_change("inner_width", CustomJS(args={"x": plot.x_range, "y": plot.y_range}, code=_KEEP_SCALE))
-    show_all = CustomJS(args={"plot": plot, "low": low.tolist(), "high": high.tolist()}, code=_SHOW_ALL)
-    plot.js_on_event(Reset, show_all)
-    plot.js_on_event(DocumentReady, show_all)
+    plot.legend.update(label_text_font_size="12px", spacing=0, padding=6, margin=6, background_fill_alpha=0.85)
+    _hold_scale(plot, low.tolist(), high.tolist())
     return plot
+
+
+def _hold_scale(plot: Figure, low: list[float], high: list[float]) -> None:
+    """Give both axes of a figure one scale, whatever its width."""
+    from bokeh.events import Reset  # noqa: PLC0415
+    from bokeh.models import CustomJS  # noqa: PLC0415
+
+    args = {"plot": plot, "x": plot.x_range, "y": plot.y_range, "low": low, "high": high}
+    plot.js_on_change("inner_width", CustomJS(args=args, code=_ON_WIDTH))
+    plot.js_on_event(Reset, CustomJS(args=args, code=_SHOW_ALL))
 
 
 def draw_errors(scene: Scene, gate_m: float) -> Model:
@@ -120,10 +131,7 @@ def draw_offsets(scene: Scene, gate_m: float) -> Model:
     plot = figure(
         name="offsets",
         height=340,
-        width=340,
-        aspect_ratio=1,
-        sizing_mode="scale_width",
-        max_width=420,
+        sizing_mode="stretch_width",
         tools="save",
         x_range=Range1d(-gate_m, gate_m),
         y_range=Range1d(-gate_m, gate_m),
@@ -132,7 +140,9 @@ def draw_offsets(scene: Scene, gate_m: float) -> Model:
         tooltips=[("class", "@sign_class"), ("east", "@east_m{0.00} m"), ("north", "@north_m{0.00} m")],
     )
     _style(plot)
-    plot.circle(x=[0], y=[0], radius=gate_m, fill_color=None, line_color=GREY, line_dash="dashed", name="gate")
+    angle = np.linspace(0, 2 * np.pi, 181)
+    plot.line(gate_m * np.cos(angle), gate_m * np.sin(angle), line_color=GREY, line_dash="dashed", name="gate")
+    _hold_scale(plot, [-1.05 * gate_m] * 2, [1.05 * gate_m] * 2)
     source = {name: found[name].to_numpy() for name in ("east_m", "north_m", "sign_class")}
     dots = plot.scatter(
         "east_m", "north_m", source=source, size=7, fill_color=GREEN, fill_alpha=0.7, line_color=BLACK, line_width=0.5
@@ -340,7 +350,9 @@ def _draw_outcome(plot: Figure, scene: Scene, outcome: str, label: str, **looks:
         **{"line_width": 2.5} | looks,
     )
     tip = _TIP.format(colour=looks["line_color"] if outcome != "TP" else GREEN, title=label)
-    plot.add_tools(HoverTool(renderers=[dots], tooltips=tip, visible=False))
+    # On a pole with a found, a missed and a false sign each tip needs a side of its own.
+    side = {"TP": "right", "FN": "left", "FP": "below"}[outcome]
+    plot.add_tools(HoverTool(renderers=[dots], tooltips=tip, attachment=side, visible=False))
 
 
 def _style(plot: Figure) -> None:
