@@ -18,8 +18,8 @@ def test_every_command_and_option_in_the_readme_exists():
     pages = {}
     for line in re.findall(r"^geofleet .*$", README, flags=re.MULTILINE):
         words = line.partition("#")[0].replace('"', " ").split()[1:]
-        command = [word for word in words[:2] if re.fullmatch(r"[a-z]+", word)]
-        command = command if command[0] == "ingest" else command[:1]
+        command = [word for word in words[:2] if re.fullmatch(r"[a-z-]+", word) and not word.startswith("-")]
+        command = command if command[0] in {"ingest", "study"} else command[:1]
         key = " ".join(command)
         if key not in pages:
             result = CliRunner().invoke(app, [*command, "--help"], env={"COLUMNS": "200"})

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.compute as pc
@@ -19,7 +22,7 @@ from geofleet.errors import ConfigError
 from geofleet.steps.aggregate import aggregate
 from geofleet.steps.evaluate import evaluate
 from geofleet.steps.simulate import simulate
-from geofleet.tables.schemas import STUDY_SCORES
+from geofleet.tables.schemas import SIGNS, STUDY_SCORES
 from geofleet.tables.store import read_table
 from geofleet.workflows.study import units
 from geofleet.workflows.study.compare import compare
@@ -27,7 +30,7 @@ from geofleet.workflows.study.fleet_size import fleet_size
 from geofleet.workflows.study.methods import METHODS, parse_methods
 from geofleet.workflows.study.paper import paper_curve, paper_points, paper_table
 from geofleet.workflows.study.results import totals
-from geofleet.workflows.study.units import run_study
+from geofleet.workflows.study.units import Unit, map_fleets, run_study, simulate_fleets, world_batch
 from geofleet.workflows.study.worlds import USUAL_PRIOR, Study, prepare_worlds
 
 RAW = Path(__file__).parents[2] / "data" / "raw"
@@ -194,3 +197,35 @@ def test_impossible_studies_are_refused(inputs):
         worlds(inputs, sweep="semantic_rate")
     with pytest.raises(ConfigError, match="workers"):
         run_study(small(inputs), Path("unused-study"), n_workers=0)
+
+
+def test_the_page_of_results_is_written_from_the_output(inputs, tmp_path, repo, monkeypatch):
+    spec = importlib.util.spec_from_file_location("write_results", repo / "scripts" / "write_results.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(module, "DOCS", tmp_path)
+    monkeypatch.setattr(module, "FIGURES", tmp_path / "figures")
+    monkeypatch.setattr(sys, "argv", ["write_results.py", str(tmp_path / "study")])
+    result = compare(small(inputs, "dbscan,dbscan-corrected", sizes=(5,), n_replicates=3), tmp_path / "study")
+    module.main()
+    page = (tmp_path / "results.md").read_text(encoding="utf-8")
+    row = result.table[0]
+    assert f"| {row['f1']:.3f} ± " in page
+    assert f"| {row['gospa_m']:.3f} ± {row['gospa_m_sd']:.3f} |" in page
+    assert "tracker paper" in page
+    assert (tmp_path / "figures" / "methods.svg").is_file()
+    shutil.rmtree(tmp_path / "study")
+    module.main()
+    assert (tmp_path / "results.md").read_text(encoding="utf-8") == page, "what has not been run stays as it was"
+
+
+def test_a_fleet_alone_has_the_detections_it_has_among_others(inputs, tmp_path):
+    """Methods with a prior map each fleet by itself, from a folder of its own."""
+    study = small(inputs, "dbscan")
+    units = tuple(Unit(number, "dbscan-first", 3, tmp_path / "unit.json") for number in (1, 2))
+    batch = replace(world_batch(study, study.worlds[0]), units=units)
+    fleets = simulate_fleets(batch, tmp_path)
+    together = map_fleets(batch, fleets, study.methods[0], 3)
+    for number in (1, 2):
+        aggregate(fleets.of(number), tmp_path / "alone.parquet", config=study.worlds[0].config, n_vehicles=3)
+        assert read_table(SIGNS, tmp_path / "alone.parquet").equals(together[number])

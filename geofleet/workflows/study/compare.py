@@ -152,7 +152,8 @@ def _draw_sweep(path: Path, summary: Rows, caption: str) -> None:
 def _draw_methods(path: Path, summary: Rows, caption: str) -> None:
     """Draw the methods one below the other, as Table 2 lists them."""
     methods = list(dict.fromkeys(row["method"] for row in summary))
-    with figure_file(path, caption=f"{caption}\n{BARS}", size=(7.6, 1.4 + 0.34 * len(methods))) as figure:
+    spread = "Means over fleets; bars: standard deviation."
+    with figure_file(path, caption=f"{caption}\n{spread}", size=(7.6, 1.4 + 0.34 * len(methods))) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         for axes, score in ((left, "f1"), (right, "gospa_m")):
             _draw_dots(axes, find(summary, score=score), methods, score)

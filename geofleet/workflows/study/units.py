@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import shutil
 from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
@@ -208,12 +209,10 @@ class Fleets:
     references: dict[int, pa.Table]
 
     def of(self, replicate: int) -> Path:
-        """Return a folder of detections of one fleet alone, and where its prior map is beside it."""
-        folder = self.folder / f"fleet-{replicate}"
-        if not folder.is_dir():
-            folder.mkdir()
-            run = f"run_id={self.run_ids[replicate]}"
-            (folder / run).symlink_to(self.folder / "simulation" / "detections" / run, target_is_directory=True)
+        """Return a folder with the detections of one fleet alone."""
+        folder, run = self.folder / f"fleet-{replicate}", f"run_id={self.run_ids[replicate]}"
+        if not folder.is_dir():  # links, but of files: readers of partitioned folders follow no others
+            shutil.copytree(self.folder / "simulation" / "detections" / run, folder / run, copy_function=os.link)
         return folder
 
     def scene(self, batch: Batch, replicate: int) -> pa.Table:
