@@ -623,7 +623,7 @@ def test_signs_on_a_board_stand_where_the_board_has_them(read, orientation):
     rows = {row["sign_id"]: row for row in table.to_pylist()}
     place = dict(zip(table["sign_id"].to_pylist(), metres(table), strict=True))
     assert {name: row["sign_class"] for name, row in rows.items()} == {
-        "534": "sign_board",
+        "534": "unspecified",
         "535": "speed_limit:60",
         "536": "plate_vehicle",
         "537": "no_overtaking",
