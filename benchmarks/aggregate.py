@@ -6,10 +6,10 @@
 
 Parquet in, fused table out; eps 4 m, min_samples 3 within each class. *wide*: 20 passes over an area that grows;
 *dense*: the same 5,446 signs, passes that grow (`aggregate_scenes.py`; simulated, seed 0). Every line is a process of
-its own, timed from the call on, imports of the peer excluded, with its peak memory. All clusterings get the same east
-and north and must give the same groups and the same noise. Peers that are not installed are skipped by name:
-`pip install dbscan`, and Debian's postgresql-15-postgis-3, which is started for the run below a temporary folder, on
-127.0.0.1, as an unprivileged user.
+its own, timed from the call on, with its CPU time (imports too; of PostGIS only its client's) and its peak memory. All
+clusterings get the same east and north and must give the same groups and noise. Peers that are not installed are
+skipped by name: `pip install dbscan`, and Debian's postgresql-15-postgis-3, which is started for the run below a
+temporary folder, on 127.0.0.1, as an unprivileged user.
 """
 
 from __future__ import annotations
@@ -246,7 +246,7 @@ def compare(scene: str, size: int, only: list[str], folder: Path) -> dict[str, d
             print(f"    {name:16s} skipped: not installed")
             continue
         found[name] = measure(name, path, work)
-        times = "".join(f"{found[name].get(key, float('nan')):12.2f} s" for key in ("whole_s", "cluster_s"))
+        times = "".join(f"{found[name].get(key, float('nan')):12.2f} s" for key in ("whole_s", "cluster_s", "cpu_s"))
         print(f"    {name:16s}{times}{found[name]['peak_mb']:10.0f} MB", flush=True)
     labels = {name: np.load(work / name / "labels.npy") for name in found if (work / name / "labels.npy").exists()}
     if len(labels) > 1:
@@ -274,10 +274,11 @@ def main() -> None:
     args = parser.parse_args()
     if args.task:
         name, path, work = args.task
-        result = TASKS[name](Path(path), Path(work))
+        begin = time.process_time()
+        result = TASKS[name](Path(path), Path(work)) | {"cpu_s": time.process_time() - begin}
         print(json.dumps(result | {"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}))
         return
-    print(f"{'':20s}{'end to end':>14s}{'clustering':>14s}{'peak':>13s}")
+    print(f"{'':20s}{'end to end':>14s}{'clustering':>14s}{'CPU, all':>14s}{'peak':>13s}")
     with TemporaryDirectory(dir=args.folder) as name:
         for scene in args.scenes:
             wholes = []

@@ -210,6 +210,7 @@ def _stage(
         )
     finally:
         connection.close()
+        pa.default_memory_pool().release_unused()
 
 
 def _tile_tasks(staged: Staged, settings: AggregateConfig) -> list[TileTask]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     Columns = dict[str, NDArray[Any]]
     Ints = NDArray[np.int64]
 
-PIECE_ROWS = 60_000  # signs built and written at a time: tens of megabytes
+PIECE_ROWS = 30_000  # signs built and written at a time: tens of megabytes
 _NUMBERED_CLASS = re.compile(r"(?P<concept>[^:]+):(?P<value>-?\d+(\.\d+)?)(?P<unit>\D*)")
 _FUSED = (
     *("var_e_m2", "var_n_m2", "cov_en_m2", "class_confidence", "n_passes", "n_detections"),
