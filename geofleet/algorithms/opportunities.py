@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
 
+_COS_ASIDE = -0.5  # 120 degrees
 _REACH = 1  # cells are as wide as the longest range
 
 
@@ -48,13 +49,43 @@ def count_opportunities(xy: Floats, path_xy: Floats, first: Ints, *, range_m: Fl
     InputError
         A coordinate or a sensor's value is not finite, or a range is not positive.
     """
+    return view_chances(xy, path_xy, first, range_m=range_m, fov_deg=fov_deg, least_frames=0.0, full_frames=1.0)[1]
+
+
+def view_chances(
+    xy: Floats,
+    path_xy: Floats,
+    first: Ints,
+    *,
+    range_m: Floats,
+    fov_deg: Floats,
+    least_frames: float,
+    full_frames: float,
+    view_xy: Floats | None = None,
+) -> tuple[Floats, Ints]:
+    """Return, for every place, how many chances to report it passes had, and how many passes had it in view.
+
+    Parameters
+    ----------
+    xy, path_xy, first, range_m, fov_deg
+        As for `count_opportunities`, whose errors are raised too.
+    least_frames, full_frames
+        A pass with `least_frames` vertices or less in view had no chance, with `full_frames` or more a full one; in
+        between in proportion.
+    view_xy
+        (n, 2) the way each place is looked at (east, north): only views within 120° of it count; (0, 0) for any.
+
+    Returns
+    -------
+    (n,) float64, a chance counting in part where a pass saw the place briefly, and (n,) int64.
+    """
     values = (xy, path_xy, range_m, fov_deg)
     if not all(np.isfinite(v).all() for v in values) or (np.asarray(range_m) <= 0).any():
         raise InputError(
             "a position, range or opening angle is not finite, or a range is not positive.", where="passes"
         )
     if len(xy) == 0 or len(path_xy) == 0:
-        return np.zeros(len(xy), np.int64)
+        return np.zeros(len(xy)), np.zeros(len(xy), np.int64)
     side_m = float(np.max(range_m))
     low = xy.min(axis=0)
     cell = np.floor((xy - low) / side_m).astype(np.int64) + _REACH
@@ -62,8 +93,9 @@ def count_opportunities(xy: Floats, path_xy: Floats, first: Ints, *, range_m: Fl
     keys = cell[:, 1] * width + cell[:, 0]
     order = np.argsort(keys, kind="stable")
     cells, starts = np.unique(keys[order], return_index=True)
-    counts: Ints = _count(
+    chances, counts = _count(
         np.ascontiguousarray(xy[order], np.float64),
+        np.zeros((len(xy), 2)) if view_xy is None else np.ascontiguousarray(view_xy[order], np.float64),
         cells,
         np.append(starts, len(xy)),
         (np.floor((path_xy - low) / side_m).astype(np.int64) + _REACH, width),
@@ -71,10 +103,11 @@ def count_opportunities(xy: Floats, path_xy: Floats, first: Ints, *, range_m: Fl
         first,
         np.asarray(range_m, np.float64),
         np.cos(np.radians(np.minimum(fov_deg, 360.0) / 2)),
+        (least_frames, full_frames),
     )
-    result = np.empty_like(counts)
-    result[order] = counts
-    return result
+    back = np.empty_like(order)
+    back[order] = np.arange(len(order))
+    return chances[back], counts[back]
 
 
 @njit(cache=True, nogil=True)
@@ -89,6 +122,7 @@ def _heading(path_xy: Floats, a: int, b: int, i: int) -> tuple[float, float]:
 @njit(cache=True, nogil=True)
 def _count(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
     xy: Floats,
+    view_xy: Floats,
     cells: Ints,
     starts: Ints,
     grid: tuple[Ints, int],
@@ -96,10 +130,14 @@ def _count(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
     first: Ints,
     range_m: Floats,
     cos_half_fov: Floats,
-) -> Ints:
+    ramp: tuple[float, float],
+) -> tuple[Floats, Ints]:
     vertex_cell, width = grid
-    counts, last_pass = np.zeros(len(xy), np.int64), np.full(len(xy), -1, np.int64)
+    counts = np.zeros(len(xy), np.int64)
+    chances, frames = np.zeros(len(xy)), np.zeros(len(xy), np.int64)
+    seen = np.empty(len(xy), np.int64)
     for p in range(first.size - 1):
+        n_seen = 0
         for i in range(first[p], first[p + 1]):
             east, north = _heading(path_xy, first[p], first[p + 1], i)
             column, row = vertex_cell[i]
@@ -109,11 +147,16 @@ def _count(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
                 low = np.searchsorted(cells, key_row * width + max(column - _REACH, 0))
                 high = np.searchsorted(cells, key_row * width + min(column + _REACH, width - 1), side="right")
                 for j in range(starts[low], starts[high]):
-                    if last_pass[j] == p:
-                        continue
                     de, dn = xy[j, 0] - path_xy[i, 0], xy[j, 1] - path_xy[i, 1]
                     d = math.hypot(de, dn)
-                    if d < range_m[p] and de * east + dn * north > d * cos_half_fov[p]:
-                        last_pass[j] = p
-                        counts[j] += 1
-    return counts
+                    is_from_front = de * view_xy[j, 0] + dn * view_xy[j, 1] >= _COS_ASIDE * d
+                    if d < range_m[p] and de * east + dn * north > d * cos_half_fov[p] and is_from_front:
+                        if frames[j] == 0:
+                            seen[n_seen] = j
+                            n_seen += 1
+                        frames[j] += 1
+        for j in seen[:n_seen]:
+            chances[j] += min(max((frames[j] - ramp[0]) / (ramp[1] - ramp[0]), 0.0), 1.0)
+            counts[j] += 1
+            frames[j] = 0
+    return chances, counts

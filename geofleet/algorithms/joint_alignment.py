@@ -1,0 +1,293 @@
+"""Where each pass lies against the others: a vote over pairs of equal class, one pass after the other.
+
+Signs repeat along a road, so a nearest-neighbour start can lock on shifted by one sign. Here every pass is laid on the
+map that the passes before it made at each offset that brings one of its tracks onto a sign of its class, and takes the
+most likely: with the GNSS prior and robust to tracks without a partner. Then each pass is taken out and laid again on
+the map of all others, until nothing moves.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+CORE_M = 0.5
+"""Passes laid on each other fit to this, an axis, beside what their tracks declare."""
+REACH_SIGMAS = 4.0
+SIGN_DENSITY_M2 = 1e-3
+"""Signs a square metre near a road: what a chance partner is weighed against."""
+OTHER_CLASS = 0.01
+"""A partner of another class counts this much: a misread class still holds the pass in place."""
+N_ROUNDS = 3
+MOVED_M = 0.25
+NO_POINT = -1
+
+
+def align_passes(xy_m: Floats, var_m2: Floats, class_code: Ints, first: Ints, sigma_m: Floats, cell_m: float) -> Floats:
+    """Return the offset of every pass against their common map, (n_passes, 2).
+
+    Parameters
+    ----------
+    xy_m, var_m2, class_code
+        (n, 2), (n,), (n,) places of the tracks (bias taken out), their variance an axis, their classes; by pass.
+    first
+        (n_passes + 1,) tracks `first[v]:first[v + 1]` are those of pass v.
+    sigma_m
+        (n_passes,) σ an axis of the offset of each pass; the most certain pass with the most tracks comes first.
+    cell_m
+        Passes that share cells as wide are laid one after the other, so that each finds a map where it drove.
+    """
+    n_passes = len(first) - 1
+    if n_passes == 0:
+        return np.zeros((0, 2))
+    offset: Floats = _align(
+        np.ascontiguousarray(xy_m),
+        np.sqrt(var_m2 + CORE_M**2),
+        class_code,
+        first,
+        sigma_m,
+        _order(xy_m, first, sigma_m, cell_m),
+    )
+    return offset
+
+
+def _order(xy_m: Floats, first: Ints, sigma_m: Floats, cell_m: float) -> Ints:
+    """Return the order in which passes are laid: the surest first, then whoever drove most where others drove."""
+    n_passes = len(first) - 1
+    cell = np.floor((xy_m - xy_m.min(axis=0)) / cell_m).astype(np.int64)
+    _, key = np.unique(cell[:, 0] * (int(cell[:, 1].max()) + 1) + cell[:, 1], return_inverse=True)
+    owner = np.repeat(np.arange(n_passes), np.diff(first))
+    by_cell = np.argsort(key, kind="stable")
+    start = np.searchsorted(key[by_cell], np.arange(int(key.max()) + 2))
+    order: Ints = _walk(key, first, owner[by_cell], start, np.diff(first) / np.maximum(sigma_m, 1e-3) ** 2)
+    return order
+
+
+@njit(cache=True, nogil=True)
+def _walk(key: Ints, first: Ints, owner: Ints, start: Ints, worth: Floats) -> Ints:
+    """Take the pass with the most tracks in cells that are taken already; ties and new beginnings by worth."""
+    n = first.size - 1
+    shared, is_laid, is_taken = np.zeros(n), np.zeros(n, np.bool_), np.zeros(start.size - 1, np.bool_)
+    order = np.empty(n, np.int64)
+    for step in range(n):
+        best = -1
+        for v in range(n):
+            if not is_laid[v] and (
+                best < 0 or shared[v] > shared[best] or (shared[v] == shared[best] and worth[v] > worth[best])
+            ):
+                best = v
+        order[step], is_laid[best] = best, True
+        for i in range(first[best], first[best + 1]):
+            if not is_taken[key[i]]:
+                is_taken[key[i]] = True
+                for k in range(start[key[i]], start[key[i] + 1]):
+                    shared[owner[k]] += 1
+    return order
+
+
+@njit(cache=True, nogil=True)
+def _align(xy_m: Floats, spread_m: Floats, class_code: Ints, first: Ints, sigma_m: Floats, order: Ints) -> Floats:  # noqa: PLR0917
+    n, n_passes = len(xy_m), first.size - 1
+    offset = np.zeros((n_passes, 2))
+    point_of = np.full(n, NO_POINT)
+    room = n * (N_ROUNDS + 2)  # a round makes n new points at most
+    total, count, of_class = np.zeros((room, 2)), np.zeros(room, np.int64), np.zeros(room, np.int64)
+    n_points, base_var = 0, sigma_m[order[0]] ** 2
+    for turn in range(1 + N_ROUNDS):
+        n_moved = 0
+        for step in range(n_passes):
+            v = order[step]
+            rows = np.arange(first[v], first[v + 1])
+            for i in rows:
+                if point_of[i] != NO_POINT:
+                    count[point_of[i]] -= 1
+                    total[point_of[i]] -= xy_m[i] - offset[v]
+            near, near_start = _near(
+                xy_m, rows, total, count, n_points, REACH_SIGMAS * np.sqrt(sigma_m[v] ** 2 + base_var)
+            )
+            sigma2 = sigma_m[v] ** 2 + base_var
+            found = _best(xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start, sigma2, offset[v])
+            if step == 0 and turn == 0:
+                found = (0.0, 0.0)
+            if (found[0] - offset[v, 0]) ** 2 + (found[1] - offset[v, 1]) ** 2 > MOVED_M**2:
+                n_moved += 1
+            offset[v, 0], offset[v, 1] = found
+            n_points = _lay(
+                xy_m,
+                spread_m,
+                class_code,
+                rows,
+                offset[v],
+                total,
+                count,
+                of_class,
+                near,
+                near_start,
+                point_of,
+                n_points,
+            )
+        if turn and n_moved == 0:
+            break
+    return offset
+
+
+@njit(cache=True, nogil=True)
+def _near(xy_m: Floats, rows: Ints, total: Floats, count: Ints, n_points: int, reach_m: float) -> tuple[Ints, Ints]:  # noqa: PLR0917
+    """Return the points of the map within reach of each row, as CSR."""
+    low_e, low_n = xy_m[rows, 0].min() - reach_m, xy_m[rows, 1].min() - reach_m
+    high_e, high_n = xy_m[rows, 0].max() + reach_m, xy_m[rows, 1].max() + reach_m
+    inside = np.empty(n_points, np.int64)
+    n_inside = 0
+    for k in range(n_points):
+        if count[k] > 0:
+            east, north = total[k, 0] / count[k], total[k, 1] / count[k]
+            if low_e <= east <= high_e and low_n <= north <= high_n:
+                inside[n_inside] = k
+                n_inside += 1
+    start = np.zeros(rows.size + 1, np.int64)
+    near = np.empty(rows.size * 8 + 8, np.int64)
+    n_near = 0
+    for r in range(rows.size):
+        for k in inside[:n_inside]:
+            east = total[k, 0] / count[k] - xy_m[rows[r], 0]
+            north = total[k, 1] / count[k] - xy_m[rows[r], 1]
+            if east * east + north * north < reach_m * reach_m:
+                if n_near == near.size:
+                    grown = np.empty(2 * near.size, np.int64)
+                    grown[:n_near] = near
+                    near = grown
+                near[n_near] = k
+                n_near += 1
+        start[r + 1] = n_near
+    return near[:n_near], start
+
+
+@njit(cache=True, nogil=True)
+def _gain(  # noqa: PLR0917
+    east: float,
+    north: float,
+    xy_m: Floats,
+    spread_m: Floats,
+    class_code: Ints,
+    rows: Ints,
+    total: Floats,
+    count: Ints,
+    of_class: Ints,
+    near: Ints,
+    near_start: Ints,
+) -> tuple[float, float, float]:
+    """Return the log-likelihood of an offset, and the offset that the partners it finds agree on."""
+    value, weight, sum_e, sum_n = 0.0, 1e-12, 0.0, 0.0
+    for r in range(rows.size):
+        i = rows[r]
+        var = spread_m[i] ** 2
+        best, best_e, best_n = 0.0, 0.0, 0.0
+        for at in range(near_start[r], near_start[r + 1]):
+            k = near[at]
+            de = xy_m[i, 0] - total[k, 0] / count[k]
+            dn = xy_m[i, 1] - total[k, 1] / count[k]
+            chi2 = ((de - east) ** 2 + (dn - north) ** 2) / var
+            if chi2 < 18.0:
+                density = np.exp(-chi2 / 2) / (2 * np.pi * var * SIGN_DENSITY_M2)
+                if of_class[k] != class_code[i]:
+                    density *= OTHER_CLASS
+                if density > best:
+                    best, best_e, best_n = density, de, dn
+        value += np.log1p(best)
+        share = best / (1 + best) / var
+        weight += share
+        sum_e += share * best_e
+        sum_n += share * best_n
+    return value, sum_e / weight, sum_n / weight
+
+
+@njit(cache=True, nogil=True)
+def _best(  # noqa: PLR0917
+    xy_m: Floats,
+    spread_m: Floats,
+    class_code: Ints,
+    rows: Ints,
+    total: Floats,
+    count: Ints,
+    of_class: Ints,
+    near: Ints,
+    near_start: Ints,
+    sigma2: float,
+    offset: Floats,
+) -> tuple[float, float]:
+    """Return the likeliest offset, among those that bring a row onto a point of its class and the present one."""
+    best, found_e, found_n = -np.inf, offset[0], offset[1]
+    for r in range(-1, rows.size):
+        begin, end = (0, 1) if r < 0 else (near_start[r], near_start[r + 1])
+        for at in range(begin, end):
+            if r < 0:
+                east, north = offset[0], offset[1]
+            else:
+                k, i = near[at], rows[r]
+                if of_class[k] != class_code[i]:
+                    continue
+                east, north = xy_m[i, 0] - total[k, 0] / count[k], xy_m[i, 1] - total[k, 1] / count[k]
+            for _ in range(2):  # as it stands, and where its partners pull it
+                value, pulled_e, pulled_n = _gain(
+                    east, north, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start
+                )
+                value -= (east * east + north * north) / (2 * sigma2)
+                if value > best:
+                    best, found_e, found_n = value, east, north
+                east, north = pulled_e, pulled_n
+    return found_e, found_n
+
+
+@njit(cache=True, nogil=True)
+def _lay(  # noqa: PLR0917
+    xy_m: Floats,
+    spread_m: Floats,
+    class_code: Ints,
+    rows: Ints,
+    offset: Floats,
+    total: Floats,
+    count: Ints,
+    of_class: Ints,
+    near: Ints,
+    near_start: Ints,
+    point_of: Ints,
+    n_points: int,
+) -> int:
+    """Add the rows of a pass to the map: to the nearest free point of their class, or as new points."""
+    taken = np.full(rows.size, NO_POINT)
+    for r in range(rows.size):
+        i = rows[r]
+        best, reach2 = NO_POINT, (3 * spread_m[i]) ** 2
+        for at in range(near_start[r], near_start[r + 1]):
+            k = near[at]
+            if of_class[k] != class_code[i]:
+                continue
+            # `near` was found before the rows were laid: a point that a row of this pass has is not free
+            is_free = True
+            for other in taken[:r]:
+                is_free = is_free and other != k
+            if is_free:
+                de = xy_m[i, 0] - offset[0] - total[k, 0] / count[k]
+                dn = xy_m[i, 1] - offset[1] - total[k, 1] / count[k]
+                if de * de + dn * dn < reach2:
+                    best, reach2 = k, de * de + dn * dn
+        if best == NO_POINT:
+            if point_of[i] != NO_POINT and count[point_of[i]] == 0:
+                best = point_of[i]
+            else:
+                best, n_points = n_points, n_points + 1
+            total[best] = 0.0
+            of_class[best] = class_code[i]
+        taken[r] = best
+        point_of[i] = best
+        total[best] += xy_m[i] - offset
+        count[best] += 1
+    return n_points

@@ -1,0 +1,203 @@
+"""What a group of tracks says besides its place: which class the sign has, and whether there is one.
+
+Classes: log π_j = log prior + Σ log M[:, c], with M the confusion of each kind of sensor. Existence: a sign is reported
+by a share of the passes that had it in view that scatters around P_D (beta-binomial), a persistent ghost by a smaller
+one, and clutter once. M, P_D and the clutter are learnt by expectation-maximisation from priors that are stated here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import betaln, gammaln
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+SIGN_DENSITY_M2 = 1e-3
+"""Signs a square metre beside a road: one every 30 m on either side, within 15 m."""
+ERROR_PRIOR = (2.0, 38.0)
+"""Beta prior of the share of misread tracks: 5 %, worth forty tracks."""
+CONFUSION_PRIOR = 1.0
+"""Dirichlet prior of what a misread class is taken for: as much for each other class, worth this many misreadings."""
+DETECTION_PRIOR = (18.0, 2.0)
+"""Beta prior of P_D, the chance that a pass that had a sign in view reports it: 90 %, worth twenty chances."""
+DETECTION_SPREAD = 20.0
+"""Signs differ: P_D of one sign is beta around the common one, worth this many chances."""
+GHOST = (2.0, 3.0)
+"""Share of the passes that report a persistent ghost: beta around 0.4."""
+GHOSTS_A_SIGN = 0.03
+CLUTTER_PRIOR = (0.5, 1.0)
+"""Gamma prior of clutter tracks a pass: shape, and the passes that it is worth."""
+PRIOR_MAP_KEPT = 0.9
+"""Share of a prior map's signs that still stand."""
+PRIOR_MAP_COMPLETE = 0.85
+"""Share of the signs that a prior map knows."""
+FULL_VIEW_FRAMES, LEAST_VIEW_FRAMES = 8.0, 2.0
+"""A pass had a fair chance with so many frames in view, and none with so few; in between in proportion."""
+UNTOLD_CLUTTER = 0.2
+"""Share of single tracks that are clutter where nobody knows who had the place in view."""
+BESIDE_M = 6.0
+STRAY_RATE = 0.003
+"""Of the tracks of a sign so many stray beyond every gate, and look like a second sign of its class beside it."""
+CHANCE_OF_CLUTTER = 1e-3
+"""Of a clutter track within the gate of a given place, a pass."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recognition:
+    """How classes are read: confusion a kind of sensor.
+
+    Parameters
+    ----------
+    log_confusion
+        (n_kinds, n_classes, n_classes): log-probability that class k is read as c.
+    error_rate
+        (n_kinds,) share of misread tracks.
+    """
+
+    log_confusion: Floats
+    error_rate: Floats
+
+
+def recognition(error_rate: Floats, n_classes: int, misread: Floats | None = None) -> Recognition:
+    """Return the confusion of sensors that misread so often, as `misread` (n_classes, n_classes) or any class alike."""
+    if n_classes == 1:
+        return Recognition(np.zeros((len(error_rate), 1, 1)), error_rate)
+    other = (1 - np.eye(n_classes)) * (1.0 if misread is None else misread)
+    other /= other.sum(axis=1, keepdims=True)
+    rate = np.clip(error_rate, 1e-4, 1 - 1e-4)[:, None, None]
+    return Recognition(np.log((1 - rate) * np.eye(n_classes) + rate * other + 1e-300), error_rate)
+
+
+def class_posterior(sign: Ints, n_signs: int, class_code: Ints, kind_code: Ints, read: Recognition) -> Floats:
+    """Return the log-posterior of every class, (n_signs, n_classes), classes being alike beforehand."""
+    n_classes = read.log_confusion.shape[1]
+    log_class = np.zeros((n_signs, n_classes))
+    np.add.at(log_class, sign, read.log_confusion[kind_code, :, class_code])
+    return log_class - np.logaddexp.reduce(log_class, axis=1, keepdims=True)
+
+
+def learn_recognition(
+    log_posterior: Floats,
+    sign: Ints,
+    class_code: Ints,
+    kind_code: Ints,
+    fixed_rate: Floats,
+    is_fixed: NDArray[np.bool_],
+) -> Recognition:
+    """Return the confusion that the tracks show, one step of expectation-maximisation.
+
+    `fixed_rate` is kept for the kinds that `is_fixed` (a prior map).
+    """
+    n_kinds, n_classes = len(fixed_rate), log_posterior.shape[1]
+    if n_classes == 1:
+        return recognition(fixed_rate, 1)
+    posterior = np.exp(log_posterior[sign])
+    right = posterior[np.arange(len(sign)), class_code]
+    wrong = np.bincount(kind_code, 1 - right, minlength=n_kinds)
+    total = np.bincount(kind_code, minlength=n_kinds)
+    rate = (ERROR_PRIOR[0] + wrong) / (sum(ERROR_PRIOR) + total)
+    expected = np.zeros((n_classes, n_classes))
+    learnt = ~is_fixed[kind_code]
+    np.add.at(expected.T, class_code[learnt], posterior[learnt])
+    np.fill_diagonal(expected, 0.0)
+    misread = (expected + CONFUSION_PRIOR / (n_classes - 1)) / (expected.sum(axis=1, keepdims=True) + CONFUSION_PRIOR)
+    return recognition(np.where(is_fixed, fixed_rate, rate), n_classes, misread)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Support:
+    """Evidence for each sign that it exists.
+
+    Parameters
+    ----------
+    n_passes
+        (n,) passes of the fleet that report it.
+    n_in_view, n_chances
+        (n,) passes that had it in view, and the same in parts where the view was short; NaN where nobody knows.
+    n_beside
+        (n,) passes that report a sign of the same class within `BESIDE_M`, 0 without one that has far more of them.
+    in_prior
+        (n,) whether the prior map holds it; None without a prior map.
+    n_fleet
+        Passes of the fleet.
+    n_classes
+        Classes that signs may have.
+    """
+
+    n_passes: Floats
+    n_in_view: Floats
+    n_chances: Floats
+    n_beside: Floats
+    in_prior: NDArray[np.bool_] | None
+    n_fleet: int
+    n_classes: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Existence:
+    """Probability that each sign exists, (n,), and what was learnt: P_D and clutter tracks a pass."""
+
+    probability: Floats
+    detection_rate: float
+    clutter_per_pass: float
+
+
+def existence(support: Support) -> Existence:
+    """Weigh, for each group of tracks, a sign against a persistent ghost, clutter and an outdated entry of the map."""
+    n, chances = support.n_passes, np.fmax(support.n_chances, support.n_passes)
+    trials = np.fmax(support.n_in_view, support.n_passes)
+    rate, clutter = DETECTION_PRIOR[0] / sum(DETECTION_PRIOR), CLUTTER_PRIOR[0] / CLUTTER_PRIOR[1]
+    probability = np.ones(len(n))
+    for _ in range(50):
+        before = probability
+        probability = _probability(support, n, chances, trials, rate, clutter, max(float(before.sum()), 1.0))
+        told = np.isfinite(support.n_chances)
+        rate = (DETECTION_PRIOR[0] + (probability * n)[told].sum()) / (
+            sum(DETECTION_PRIOR) + (probability * chances)[told].sum()
+        )
+        single = (n == 1) & ~_is_in_prior(support)
+        clutter = (CLUTTER_PRIOR[0] + (1 - probability)[single].sum()) / (CLUTTER_PRIOR[1] + support.n_fleet)
+        if np.abs(probability - before).max(initial=0) < 1e-6:
+            break
+    return Existence(probability, float(rate), float(clutter))
+
+
+def _is_in_prior(support: Support) -> NDArray[np.bool_]:
+    return np.zeros(len(support.n_passes), np.bool_) if support.in_prior is None else support.in_prior
+
+
+def _probability(  # noqa: PLR0917
+    support: Support, n: Floats, chances: Floats, trials: Floats, rate: float, clutter: float, n_signs: float
+) -> Floats:
+    """Return the posterior of existence under these rates."""
+    told = np.isfinite(support.n_chances)
+    # where all views are short a pass reports the sign by a smaller chance: P_D times the mean part of a view
+    share = rate * np.where(told & (trials > 0), chances / np.maximum(trials, 1.0), 1.0)
+    a, b = DETECTION_SPREAD * share, DETECTION_SPREAD * (1 - share)
+    missed = np.where(told, trials - n, 0.0)
+    sign = betaln(a + n, b + missed) - betaln(a, b)
+    ghost = np.log(GHOSTS_A_SIGN) + betaln(GHOST[0] + n, GHOST[1] + missed) - betaln(*GHOST)
+    # singles: as many signs as there are would be seen by one of their passes only, against clutter over all passes
+    once = np.log(clutter * support.n_fleet / n_signs) - np.log(np.maximum(np.where(told, trials, 1.0), 1.0))
+    once = np.where(n == 1, once, n * np.log(CHANCE_OF_CLUTTER))
+    once = np.where(told, once, sign + n * np.log(UNTOLD_CLUTTER / (1 - UNTOLD_CLUTTER)))
+    second = SIGN_DENSITY_M2 * np.pi * BESIDE_M**2 / support.n_classes  # expected signs of the class beside another
+    with np.errstate(divide="ignore"):
+        stray = sign + n * np.log(STRAY_RATE * support.n_beside) - gammaln(n + 1) - np.log(second)
+    once = np.logaddexp(once, stray)
+    in_prior = _is_in_prior(support)
+    if support.in_prior is not None:
+        outdated = np.log(1 - PRIOR_MAP_KEPT) + n * np.log(CHANCE_OF_CLUTTER)
+        sign = sign + np.where(in_prior, np.log(PRIOR_MAP_KEPT), np.log(1 - PRIOR_MAP_COMPLETE))
+        other = np.where(in_prior, outdated, np.logaddexp(ghost, once))
+    else:
+        other = np.logaddexp(ghost, once)
+    exists: Floats = 1 / (1 + np.exp(np.clip(other - sign, -700, 700)))
+    return exists

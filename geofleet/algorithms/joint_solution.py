@@ -1,0 +1,157 @@
+"""Places of all signs and the nuisance of all passes at once: sparse normal equations, passes eliminated.
+
+Track i of pass v and sign j measures x = (s_j + g_v, b_v): it adds N_i to the blocks of s_j and of (g_v, b_v). A pass is
+eliminated with G = (P⁻¹ + Σ N)⁻¹, which leaves a system in the signs alone,
+
+    Λ = Σ_v [blkdiag(N_pp) - B G Bᵀ]      η = Σ_v [r_p - B G r_v]      s = Λ⁻¹ η      x_v = G (r_v - Bᵀ s)
+
+Λ and η are sums over passes: a pass can be added later, or taken out again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import linalg, sparse
+from scipy.sparse.linalg import splu
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from geofleet.algorithms.joint_tracks import Passes, Tracks
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+DENSE_UNKNOWNS = 3000
+"""Up to so many unknowns the dense factor is the fastest, and 72 MB."""
+BLOCK = 512
+"""Columns of the inverse that are solved for at a time."""
+LEAST_VAR = 1e-12
+"""Variance of what is known exactly: a bias that a sensor cannot have."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Signs and passes that the tracks agree on.
+
+    Parameters
+    ----------
+    xy_m, cov_m2
+        (n_signs, 2), (n_signs, 2, 2): places, with the offset that the fleet has in common in the covariance.
+    nuisance, nuisance_cov
+        (n_passes, 4), (n_passes, 4, 4): offset east and north, range and bearing bias; the covariance is given the signs.
+    marginal_cov
+        (4, 4) covariance of the nuisance of one pass, whatever the signs.
+    """
+
+    xy_m: Floats
+    cov_m2: Floats
+    nuisance: Floats
+    nuisance_cov: Floats
+    marginal_cov: Floats | None = None
+
+
+def solve(
+    tracks: Tracks,
+    passes: Passes,
+    sign: Ints,
+    n_signs: int,
+    nuisance: Floats,
+    *,
+    with_cov: bool,
+    marginal_of: int | None = None,
+) -> Solution:
+    """Solve for all signs and passes.
+
+    Parameters
+    ----------
+    tracks, sign
+        Tracks, and the sign of each, all ≥ 0.
+    nuisance
+        (n_passes, 4) where to expand about: a good guess keeps numbers small.
+    with_cov
+        Whether the covariances of the signs are wanted; else they are zero.
+    marginal_of
+        The pass whose `marginal_cov` is wanted.
+    """
+    n_passes = len(passes.gnss_sigma_m)
+    prior = 1 / np.maximum(
+        np.column_stack((passes.gnss_sigma_m, passes.gnss_sigma_m, passes.bias_sigma)) ** 2, LEAST_VAR
+    )
+    # expand about the weighted means of the tracks as they lie now: what is solved for is small
+    n_pp = tracks.matrix[:, :2, :2]
+    measured = tracks.origin_xy_m - nuisance[tracks.pass_code, :2]
+    start = _means(measured, n_pp, sign, n_signs)
+    shift = np.column_stack((start[sign] - measured, nuisance[tracks.pass_code, 2:]))
+    residual = tracks.vector - np.einsum("tij,tj->ti", tracks.matrix, shift)
+
+    own = np.zeros((n_passes, 4, 4))
+    np.add.at(own, tracks.pass_code, tracks.matrix)
+    own[:, np.arange(4), np.arange(4)] += prior
+    right = -prior * nuisance
+    np.add.at(right, tracks.pass_code, residual)
+    gain = np.linalg.inv(own)
+
+    coupling = _blocks(tracks.matrix[:, :, :2], tracks.pass_code, sign, (n_passes, n_signs))
+    diagonal = np.zeros((n_signs, 2, 2))
+    np.add.at(diagonal, sign, n_pp)
+    eta = np.zeros((n_signs, 2))
+    np.add.at(eta, sign, residual[:, :2])
+    eliminated = sparse.bsr_array((gain, np.arange(n_passes), np.arange(n_passes + 1))).tocsr() @ coupling
+    system = sparse.bsr_array((diagonal, np.arange(n_signs), np.arange(n_signs + 1))).tocsr() - coupling.T @ eliminated
+    wanted = [eta.ravel() - eliminated.T @ right.ravel()]
+    if marginal_of is not None:
+        wanted += list(eliminated[4 * marginal_of : 4 * marginal_of + 4].toarray())
+    solved, cov = _solved(system, np.column_stack(wanted), with_cov=with_cov)
+    step = solved[:, 0]
+    marginal = None if marginal_of is None else gain[marginal_of] + np.stack(wanted[1:]) @ solved[:, 1:]
+    moved = nuisance + np.einsum("vij,vj->vi", gain, right - (coupling @ step).reshape(n_passes, 4))
+    return Solution(start + step.reshape(n_signs, 2), cov, moved, gain, marginal)
+
+
+def _means(xy_m: Floats, weight: Floats, sign: Ints, n_signs: int) -> Floats:
+    total, moment = np.zeros((n_signs, 2, 2)), np.zeros((n_signs, 2))
+    np.add.at(total, sign, weight)
+    np.add.at(moment, sign, np.einsum("tij,tj->ti", weight, xy_m))
+    return np.linalg.solve(total, moment[:, :, None])[:, :, 0]
+
+
+def _blocks(blocks: Floats, row: Ints, column: Ints, shape: tuple[int, int]) -> sparse.csr_array:
+    """Return a sparse matrix of blocks; blocks at one place add up."""
+    order = np.lexsort((column, row))
+    start = np.searchsorted(row[order], np.arange(shape[0] + 1))
+    height, width = blocks.shape[1:]
+    matrix = sparse.bsr_array(
+        (blocks[order], column[order], start), shape=(shape[0] * height, shape[1] * width)
+    ).tocsr()
+    matrix.sum_duplicates()
+    return matrix
+
+
+def _solved(system: sparse.csr_array, right: Floats, *, with_cov: bool) -> tuple[Floats, Floats]:
+    """Solve the symmetric positive definite system; also the 2 × 2 blocks on the diagonal of its inverse."""
+    n = len(right)
+    if n <= DENSE_UNKNOWNS:
+        factor = linalg.cho_factor(system.toarray(), lower=True, overwrite_a=True, check_finite=False)
+        step = linalg.cho_solve(factor, right, check_finite=False)
+        if not with_cov:
+            return step, np.zeros((n // 2, 2, 2))
+        inverse = linalg.cho_solve(factor, np.eye(n), check_finite=False)
+        at = np.arange(n).reshape(-1, 2)
+        return step, inverse[at[:, :, None], at[:, None, :]]
+    lu = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
+    step = lu.solve(right)
+    cov = np.zeros((n // 2, 2, 2))
+    for begin in range(0, n if with_cov else 0, BLOCK):
+        stop = min(begin + BLOCK, n)
+        unit = np.zeros((n, stop - begin))
+        unit[np.arange(begin, stop), np.arange(stop - begin)] = 1.0
+        part = lu.solve(unit)[begin:stop].reshape(-1, 2, stop - begin)
+        at = np.arange((stop - begin) // 2)
+        cov[begin // 2 : stop // 2] = part[
+            at[:, None, None], np.arange(2)[None, :, None], (2 * at[:, None] + [0, 1])[:, None, :]
+        ]
+    return step, cov
