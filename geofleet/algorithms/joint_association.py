@@ -115,7 +115,7 @@ def _grid(xy_m: Floats) -> _Grid:
 @njit(cache=True, nogil=True)
 def _sweep(
     places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, birth_cost: float, grid: _Grid
-) -> Ints:  # noqa: PLR0917
+) -> Ints:
     n, n_classes = len(sign), log_prior.size
     room = max(n, sign.max() + 1) + 1
     signs = Signs(
@@ -311,7 +311,7 @@ def _cost(places: Places, signs: Signs, i: int, k: int, log_confusion: Floats, l
 @njit(cache=True, nogil=True)
 def _adopt_fragments(
     given: Ints, start: Ints, column: Ints, cost: Floats, places: Places, a: int, birth_cost: float
-) -> None:  # noqa: PLR0917
+) -> None:
     """Let tracks that stayed out join a sign whose tracks of this pass share no frame with them, the cheapest first."""
     for r in range(given.size):
         if given[r] >= 0 or places.frame_first[a + r] < 0:
