@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit
 
-from geofleet.algorithms.assignment import _assign, _Graph
+from geofleet.algorithms.assignment import _assign, _Graph  # the compiled core: one call a pass
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 NO_SIGN = -1
 GATE_CHI2 = 25.0
-MISSED_NATS = 1.0
-"""Evidence of each pass that reports the rarer of two places and not the other that they are one: passes miss little."""
 REACH_M = 15.0
 """A track further than this from a sign is never weighed against it, however little it knows."""
 
@@ -50,7 +48,7 @@ class Signs(NamedTuple):
     information: Floats  # (room, 3): ee, nn, en
     vector: Floats  # (room, 2), about `Places` as they are
     log_class: Floats  # (room, n_classes) log-likelihood of its tracks under every class
-    count: Ints  # (room,) tracks
+    n_tracks: Ints  # (room,)
     cell: Ints  # (room,) where it is filed, -1 for nowhere
     following: Ints  # (room,) the next sign in its cell, -1 at the end
 
@@ -112,49 +110,31 @@ def _grid(xy_m: Floats) -> _Grid:
     return _Grid(keys, np.full(len(keys), NO_SIGN), low, width)
 
 
+class _Free(NamedTuple):
+    """Signs without tracks, as a stack."""
+
+    stack: Ints
+    size: Ints  # (1,)
+
+
 @njit(cache=True, nogil=True)
-def _sweep(
+def _sweep(  # noqa: PLR0917 - numba takes no keyword-only arguments
     places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, birth_cost: float, grid: _Grid
 ) -> Ints:
-    n, n_classes = len(sign), log_prior.size
-    room = max(n, sign.max() + 1) + 1
-    signs = Signs(
-        np.zeros((room, 3)),
-        np.zeros((room, 2)),
-        np.zeros((room, n_classes)),
-        np.zeros(room, np.int64),
-        np.full(room, -1),
-        np.full(room, NO_SIGN),
-    )
-    for i in range(n):
-        if sign[i] != NO_SIGN:
-            _add(signs, places, log_confusion, i, sign[i], 1)
-    free = np.empty(room, np.int64)
-    n_free = 0
-    for k in range(room - 1, -1, -1):
-        if signs.count[k] == 0:
-            free[n_free] = k
-            n_free += 1
-        else:
-            _file(signs, grid, k)
-    local = np.full(room, -1)
+    signs, free = _start(places, sign, log_confusion, grid)
+    local = np.full(signs.n_tracks.size, -1)
     for v in range(places.first.size - 1):
         a, b = places.first[v], places.first[v + 1]
         for i in range(a, b):
             if sign[i] != NO_SIGN:
                 _add(signs, places, log_confusion, i, sign[i], -1)
         given = _assign_pass(places, signs, grid, local, a, b, log_confusion, log_prior, birth_cost)
-        for i in range(a, b):
-            old = sign[i]
-            if old != NO_SIGN and signs.count[old] == 0 and signs.cell[old] >= 0:
-                _unfile(signs, grid, old)
-                free[n_free] = old
-                n_free += 1
+        _give_up(signs, grid, free, sign[a:b])
         for i in range(a, b):
             k = given[i - a]
             if k == NO_SIGN:
-                n_free -= 1
-                k = free[n_free]
+                free.size[0] -= 1
+                k = free.stack[free.size[0]]
                 signs.information[k], signs.vector[k], signs.log_class[k] = 0.0, 0.0, 0.0
             sign[i] = k
             _add(signs, places, log_confusion, i, k, 1)
@@ -164,7 +144,42 @@ def _sweep(
 
 
 @njit(cache=True, nogil=True)
-def _add(signs: Signs, places: Places, log_confusion: Floats, i: int, k: int, times: int) -> None:  # noqa: PLR0917
+def _start(places: Places, sign: Ints, log_confusion: Floats, grid: _Grid) -> tuple[Signs, _Free]:
+    """Return the map of the tracks that have a sign, filed, and the signs that are free."""
+    room = max(len(sign), sign.max() + 1) + 1
+    signs = Signs(
+        np.zeros((room, 3)),
+        np.zeros((room, 2)),
+        np.zeros((room, log_confusion.shape[1])),
+        np.zeros(room, np.int64),
+        np.full(room, -1),
+        np.full(room, NO_SIGN),
+    )
+    for i in range(len(sign)):
+        if sign[i] != NO_SIGN:
+            _add(signs, places, log_confusion, i, sign[i], 1)
+    free = _Free(np.empty(room, np.int64), np.zeros(1, np.int64))
+    for k in range(room - 1, -1, -1):
+        if signs.n_tracks[k] == 0:
+            free.stack[free.size[0]] = k
+            free.size[0] += 1
+        else:
+            _file(signs, grid, k)
+    return signs, free
+
+
+@njit(cache=True, nogil=True)
+def _give_up(signs: Signs, grid: _Grid, free: _Free, before: Ints) -> None:
+    """Free the signs that a pass was the only witness of."""
+    for k in before:
+        if k != NO_SIGN and signs.n_tracks[k] == 0 and signs.cell[k] >= 0:
+            _unfile(signs, grid, k)
+            free.stack[free.size[0]] = k
+            free.size[0] += 1
+
+
+@njit(cache=True, nogil=True)
+def _add(signs: Signs, places: Places, log_confusion: Floats, i: int, k: int, times: int) -> None:  # noqa: PLR0917 - numba takes no keyword-only arguments
     """Add a track to a sign, or take it out again."""
     ee, nn, en = places.cov_m2[i]
     det = ee * nn - en * en
@@ -175,7 +190,7 @@ def _add(signs: Signs, places: Places, log_confusion: Floats, i: int, k: int, ti
     signs.vector[k, 0] += times * (wee * places.xy_m[i, 0] + wen * places.xy_m[i, 1])
     signs.vector[k, 1] += times * (wen * places.xy_m[i, 0] + wnn * places.xy_m[i, 1])
     signs.log_class[k] += times * log_confusion[places.kind_code[i], :, places.class_code[i]]
-    signs.count[k] += times
+    signs.n_tracks[k] += times
 
 
 @njit(cache=True, nogil=True)
@@ -193,7 +208,7 @@ def _cell_of(grid: _Grid, east: float, north: float) -> int:
     row = int(np.floor((north - grid.low[1]) / REACH_M))
     key = row * grid.width + column
     at = np.searchsorted(grid.keys, key)
-    return at if at < grid.keys.size and grid.keys[at] == key else -1
+    return int(at) if at < grid.keys.size and grid.keys[at] == key else -1
 
 
 @njit(cache=True, nogil=True)
@@ -202,7 +217,7 @@ def _file(signs: Signs, grid: _Grid, k: int) -> None:
     east, north, _, _, _ = _place(signs, k)
     column = int(np.floor((east - grid.low[0]) / REACH_M))
     row = int(np.floor((north - grid.low[1]) / REACH_M))
-    at = min(np.searchsorted(grid.keys, row * grid.width + column), grid.keys.size - 1)
+    at = min(int(np.searchsorted(grid.keys, row * grid.width + column)), grid.keys.size - 1)
     signs.cell[k] = at
     signs.following[k] = grid.head[at]
     grid.head[at] = k
@@ -237,8 +252,17 @@ def class_cost(log_class: Floats, log_prior: Floats, log_read: Floats) -> float:
     return float(np.log(alone) + top - np.log(both) - top_both)
 
 
+class _Pairs(NamedTuple):
+    """Tracks of a pass and the signs that each may join, as CSR; columns are places in `known`."""
+
+    start: Ints
+    column: Ints
+    cost: Floats
+    known: Ints
+
+
 @njit(cache=True, nogil=True)
-def _assign_pass(  # noqa: PLR0917
+def _assign_pass(  # noqa: PLR0917 - numba takes no keyword-only arguments
     places: Places,
     signs: Signs,
     grid: _Grid,
@@ -249,51 +273,62 @@ def _assign_pass(  # noqa: PLR0917
     log_prior: Floats,
     birth_cost: float,
 ) -> Ints:
-    """Return the sign of each track of a pass (rows a to b), `NO_SIGN` for a new one."""
+    """Return the sign of each track of a pass (rows a to b), `NO_SIGN` for a new one; `local` is -1 all over."""
     start = np.zeros(b - a + 1, np.int64)
-    column = np.empty(16 * (b - a) + 16, np.int64)
-    cost = np.empty(column.size)
-    known = np.empty(column.size, np.int64)
+    column, known, cost = np.empty(64, np.int64), np.empty(64, np.int64), np.empty(64)
     n_pairs, n_known = 0, 0
     for i in range(a, b):
-        for d_row in range(-1, 2):
-            for d_column in range(-1, 2):
-                at = _cell_of(grid, places.xy_m[i, 0] + d_column * REACH_M, places.xy_m[i, 1] + d_row * REACH_M)
-                k = grid.head[at] if at >= 0 else NO_SIGN
-                while k != NO_SIGN:
-                    if signs.count[k] > 0:
-                        value = _cost(places, signs, i, k, log_confusion, log_prior)
-                        if value < birth_cost:
-                            if n_pairs == column.size:
-                                column, cost = _twice(column), _twice(cost)
-                                known = _twice(known)
-                            if local[k] < 0:
-                                local[k] = n_known
-                                known[n_known] = k
-                                n_known += 1
-                            column[n_pairs], cost[n_pairs] = local[k], value
-                            n_pairs += 1
-                    k = signs.following[k]
+        for k in _signs_around(grid, signs, places.xy_m[i]):
+            value = _cost(places, signs, i, k, log_confusion, log_prior)
+            if value < birth_cost:
+                if n_pairs == column.size:
+                    column, known, cost = _twice(column), _twice(known), _twice_floats(cost)
+                if local[k] < 0:
+                    local[k], known[n_known] = n_known, k
+                    n_known += 1
+                column[n_pairs], cost[n_pairs] = local[k], value
+                n_pairs += 1
         start[i - a + 1] = n_pairs
-    skip = np.full(b - a, birth_cost)
-    given = _assign(_Graph(start, column[:n_pairs], cost[:n_pairs], skip), n_known)
-    _adopt_fragments(given, start, column, cost, places, a, birth_cost)
+    graph = _Graph(start, column[:n_pairs], cost[:n_pairs], np.full(b - a, birth_cost))
+    given = _assign(graph, n_known)
+    _adopt_fragments(given, _Pairs(start, column, cost, known), places, a, birth_cost)
     for r in range(b - a):
         given[r] = known[given[r]] if given[r] >= 0 else NO_SIGN
-    for k in known[:n_known]:
-        local[k] = -1
+    local[known[:n_known]] = -1
     return given
 
 
 @njit(cache=True, nogil=True)
-def _twice(values: NDArray) -> NDArray:
-    grown = np.empty(2 * values.size, values.dtype)
+def _signs_around(grid: _Grid, signs: Signs, xy_m: Floats) -> list[int]:
+    """Return the signs with tracks that are filed in the cells around a place."""
+    around = [0 for _ in range(0)]
+    for d_row in range(-1, 2):
+        for d_column in range(-1, 2):
+            at = _cell_of(grid, xy_m[0] + d_column * REACH_M, xy_m[1] + d_row * REACH_M)
+            k = grid.head[at] if at >= 0 else NO_SIGN
+            while k != NO_SIGN:
+                if signs.n_tracks[k] > 0:
+                    around.append(k)
+                k = signs.following[k]
+    return around
+
+
+@njit(cache=True, nogil=True)
+def _twice(values: Ints) -> Ints:
+    grown = np.empty(2 * values.size, np.int64)
     grown[: values.size] = values
     return grown
 
 
 @njit(cache=True, nogil=True)
-def _cost(places: Places, signs: Signs, i: int, k: int, log_confusion: Floats, log_prior: Floats) -> float:  # noqa: PLR0917
+def _twice_floats(values: Floats) -> Floats:
+    grown = np.empty(2 * values.size)
+    grown[: values.size] = values
+    return grown
+
+
+@njit(cache=True, nogil=True)
+def _cost(places: Places, signs: Signs, i: int, k: int, log_confusion: Floats, log_prior: Floats) -> float:  # noqa: PLR0917 - numba takes no keyword-only arguments
     east, north, ee, nn, en = _place(signs, k)
     de, dn = places.xy_m[i, 0] - east, places.xy_m[i, 1] - north
     if de * de + dn * dn > REACH_M**2:
@@ -305,115 +340,33 @@ def _cost(places: Places, signs: Signs, i: int, k: int, log_confusion: Floats, l
         return np.inf
     read = log_confusion[places.kind_code[i], :, places.class_code[i]]
     spatial = 0.5 * chi2 + np.log(2 * np.pi) + 0.5 * np.log(det)
-    return spatial + class_cost(signs.log_class[k], log_prior, read)
+    return float(spatial + class_cost(signs.log_class[k], log_prior, read))
 
 
 @njit(cache=True, nogil=True)
-def _adopt_fragments(
-    given: Ints, start: Ints, column: Ints, cost: Floats, places: Places, a: int, birth_cost: float
-) -> None:
+def _adopt_fragments(given: Ints, pairs: _Pairs, places: Places, a: int, birth_cost: float) -> None:
     """Let tracks that stayed out join a sign whose tracks of this pass share no frame with them, the cheapest first."""
     for r in range(given.size):
         if given[r] >= 0 or places.frame_first[a + r] < 0:
             continue
         best, best_cost = NO_SIGN, birth_cost
-        for pair in range(start[r], start[r + 1]):
-            if cost[pair] < best_cost:
-                is_free = True
-                for other in range(given.size):
-                    if given[other] == column[pair]:
-                        i, j = a + r, a + other
-                        is_free = is_free and (
-                            places.frame_first[j] > places.frame_last[i] or places.frame_last[j] < places.frame_first[i]
-                        )
-                if is_free:
-                    best, best_cost = column[pair], cost[pair]
+        for pair in range(pairs.start[r], pairs.start[r + 1]):
+            if pairs.cost[pair] < best_cost and _never_with(given, pairs.column[pair], places, a, r):
+                best, best_cost = pairs.column[pair], pairs.cost[pair]
         given[r] = best
 
 
-def merge(places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, *, birth_cost: float) -> Ints:
-    """Join signs that are likelier one than two.
-
-    Two births cost more than one, passes report one of them only, and they agree in place and class; against it are the
-    passes that hold both in one frame, of which one track would be cast out.
-
-    Parameters and result are those of `sweep`; the cheapest pair is joined first.
-    """
-    from scipy.spatial import cKDTree  # noqa: PLC0415
-
-    n_signs = int(sign.max(initial=-1)) + 1
-    information, vector = np.zeros((n_signs, 3)), np.zeros((n_signs, 2))
-    ee, nn, en = places.cov_m2.T
-    det = ee * nn - en * en
-    for at, weight in enumerate((nn / det, ee / det, -en / det)):
-        information[:, at] = np.bincount(sign, weight, minlength=n_signs)
-    east, north = places.xy_m.T
-    vector[:, 0] = np.bincount(sign, (nn * east - en * north) / det, minlength=n_signs)
-    vector[:, 1] = np.bincount(sign, (ee * north - en * east) / det, minlength=n_signs)
-    log_class = np.zeros((n_signs, len(log_prior)))
-    np.add.at(log_class, sign, log_confusion[places.kind_code, :, places.class_code])
-    determinant = information[:, 0] * information[:, 1] - information[:, 2] ** 2
-    cov = np.column_stack((information[:, 1], information[:, 0], -information[:, 2])) / determinant[:, None]
-    xy = np.column_stack(
-        (cov[:, 0] * vector[:, 0] + cov[:, 2] * vector[:, 1], cov[:, 2] * vector[:, 0] + cov[:, 1] * vector[:, 1])
-    )
-    pairs = cKDTree(xy).query_pairs(REACH_M / 2, output_type="ndarray")
-    if not len(pairs):
-        return sign
-    one, two = pairs.T
-    s = cov[one] + cov[two]
-    d = xy[one] - xy[two]
-    det = s[:, 0] * s[:, 1] - s[:, 2] ** 2
-    chi2 = (s[:, 1] * d[:, 0] ** 2 - 2 * s[:, 2] * d[:, 0] * d[:, 1] + s[:, 0] * d[:, 1] ** 2) / det
-    own = np.logaddexp.reduce(log_class + log_prior, axis=1)
-    likely = chi2 < GATE_CHI2
-    one, two, chi2, det = one[likely], two[likely], chi2[likely], det[likely]
-    together = np.logaddexp.reduce(log_class[one] + log_class[two] + log_prior, axis=1)
-    # the class share of a birth, 1 / n_classes, is in `own`
-    saved = birth_cost - np.log(len(log_prior)) - (0.5 * chi2 + np.log(2 * np.pi) + 0.5 * np.log(det))
-    saved -= own[one] + own[two] - together
-    by_sign = np.argsort(sign, kind="stable")
-    start = np.searchsorted(sign[by_sign], np.arange(n_signs + 1))
-    owner = np.repeat(np.arange(len(places.first) - 1), np.diff(places.first))
-    n_both, n_one = _passes_of_pairs(one, two, by_sign, start, owner, places.frame_first, places.frame_last)
-    saved += MISSED_NATS * n_one - birth_cost * n_both
-    worth = np.flatnonzero(saved > 0)
-    order = worth[np.argsort(-saved[worth], kind="stable")]
-    root = np.arange(n_signs)
-    used = np.zeros(n_signs, np.bool_)
-    for a, b in zip(one[order].tolist(), two[order].tolist(), strict=True):
-        if not (used[a] or used[b]):
-            root[b] = a
-            used[a] = used[b] = True
-    return np.unique(root[sign], return_inverse=True)[1].astype(np.int64)
+@njit(cache=True, nogil=True)
+def _never_with(given: Ints, column: int, places: Places, a: int, r: int) -> bool:
+    """Return whether row r shares no frame with any row of the pass that has this sign."""
+    for other in range(given.size):  # noqa: SIM110 - numba compiles no generator
+        if given[other] == column and overlap(places, a + r, a + other):
+            return False
+    return True
 
 
 @njit(cache=True, nogil=True)
-def _passes_of_pairs(  # noqa: PLR0917
-    one: Ints, two: Ints, by_sign: Ints, start: Ints, owner: Ints, first: Ints, last: Ints
-) -> tuple[Ints, Ints]:
-    """Count the passes that hold both signs of each pair in one frame, and those that hold only the rarer one."""
-    n_both, n_one = np.zeros(one.size, np.int64), np.zeros(one.size, np.int64)
-    lonely = np.zeros(2, np.int64)
-    for p in range(one.size):
-        at, other = start[one[p]], start[two[p]]
-        lonely[:] = 0
-        while at < start[one[p] + 1] or other < start[two[p] + 1]:  # tracks of a sign are sorted by pass
-            a = owner[by_sign[at]] if at < start[one[p] + 1] else owner[-1] + 1
-            b = owner[by_sign[other]] if other < start[two[p] + 1] else owner[-1] + 1
-            v = min(a, b)
-            at_end, other_end = at, other
-            while at_end < start[one[p] + 1] and owner[by_sign[at_end]] == v:
-                at_end += 1
-            while other_end < start[two[p] + 1] and owner[by_sign[other_end]] == v:
-                other_end += 1
-            meet = False
-            for i in by_sign[at:at_end]:
-                for j in by_sign[other:other_end]:
-                    meet = meet or first[i] < 0 or first[j] < 0 or (first[i] <= last[j] and first[j] <= last[i])
-            n_both[p] += meet
-            lonely[0] += other_end == other
-            lonely[1] += at_end == at
-            at, other = at_end, other_end
-        n_one[p] = lonely.min()
-    return n_both, n_one
+def overlap(places: Places, i: int, j: int) -> bool:
+    """Return whether two tracks of a pass may share a frame; where frames are not told, they may."""
+    first, last = places.frame_first, places.frame_last
+    return bool(first[i] < 0 or first[j] < 0 or (first[i] <= last[j] and first[j] <= last[i]))

@@ -1,0 +1,298 @@
+"""The alternation of joint fusion: association, normal equations and what residuals teach, until nothing changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from geofleet.algorithms import joint_evidence as evidence
+from geofleet.algorithms.joint_alignment import align_passes
+from geofleet.algorithms.joint_association import NO_SIGN, Places, sweep
+from geofleet.algorithms.joint_merging import merge
+from geofleet.algorithms.joint_solution import solve
+from geofleet.algorithms.joint_tracks import Passes, Tracks, pass_biases, places, with_jitter
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from geofleet.algorithms.joint_solution import Solution
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+LOOSE_M = (0.5, 0.25)
+"""The first rounds of association allow for this beside what is declared: passes are not yet well laid."""
+MAX_ROUNDS = 20
+SETTLED_M = 1e-4
+JITTERS_M = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2])
+"""Errors of places beyond what tracks declare, an axis: the likeliest of these is taken for the fleet, and for a pass
+that differs."""
+FLEET_JITTER_M = 0.05
+PASS_JITTER_COST = 3.0
+"""Nats that a pass must gain to have a jitter of its own."""
+
+
+PRIOR_SHIFT_M = (0.1, 1.0)
+"""Standard deviation an axis of the translation of a prior map as a whole: as a rule, and when it is off;
+each as likely beforehand."""
+PRIOR_RETYPED = 0.1
+"""Share of a prior map's signs that show another class by now."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PriorMap:
+    """A map from before, one row a sign.
+
+    Parameters
+    ----------
+    xy_m, sigma_m
+        (n, 2), (n,) places and their standard deviation an axis.
+    class_code
+        (n,) classes.
+    view_xy
+        (n, 2) the way each sign is looked at, unit vectors; (0, 0) where unknown.
+    """
+
+    xy_m: Floats
+    sigma_m: Floats
+    class_code: Ints
+    view_xy: Floats
+
+
+def with_prior(tracks: Tracks, passes: Passes, prior: PriorMap) -> tuple[Tracks, Passes]:
+    """Append the prior map as one more pass, of a kind of its own."""
+    n, code = len(prior.xy_m), len(passes.gnss_sigma_m)
+    matrix = np.zeros((n, 4, 4))
+    matrix[:, 0, 0] = matrix[:, 1, 1] = 1 / prior.sigma_m**2
+    unknown, none = np.full(n, -1), np.zeros(n)
+    own = Tracks(np.full(n, code), prior.class_code, prior.xy_m, matrix, np.zeros((n, 4)), unknown, unknown, none, none)
+    both = Tracks(*(np.concatenate((getattr(tracks, name), getattr(own, name))) for name in Tracks.__slots__))
+    kind = int(passes.kind_code.max(initial=-1)) + 1
+    return both, Passes(
+        np.append(passes.gnss_sigma_m, PRIOR_SHIFT_M[0]),
+        np.concatenate((passes.bias_sigma, np.zeros((1, 2)))),
+        np.append(passes.kind_code, kind),
+    )
+
+
+class Search:
+    """The alternation: tracks and passes as given, and the association, solution and noise as they stand."""
+
+    def __init__(self, tracks: Tracks, passes: Passes, n_classes: int, n_fleet: int) -> None:
+        self.tracks, self.passes, self.n_fleet = tracks, passes, n_fleet
+        self.n_classes = n_classes
+        n_passes, n_kinds = len(passes.gnss_sigma_m), int(passes.kind_code.max(initial=-1)) + 1
+        self.has_prior = n_passes > n_fleet
+        self.first = np.searchsorted(tracks.pass_code, np.arange(n_passes + 1))
+        self.kind = passes.kind_code[tracks.pass_code]
+        self.is_fixed = np.zeros(n_kinds, np.bool_)
+        self.fixed_rate = np.full(n_kinds, evidence.ERROR_PRIOR[0] / sum(evidence.ERROR_PRIOR))
+        if self.has_prior:
+            self.is_fixed[-1], self.fixed_rate[-1] = True, PRIOR_RETYPED
+        self.read = evidence.recognition(self.fixed_rate, n_classes)
+        self.log_prior = np.full(n_classes, -np.log(n_classes))
+        self.birth_cost = float(np.log(n_classes) - np.log(evidence.SIGN_DENSITY_M2))
+        self.jitter = np.full(n_passes, FLEET_JITTER_M)
+        self.jitter[n_fleet:] = 0.0
+        self.nuisance = np.zeros((n_passes, 4))
+        self.sign = np.full(len(tracks.pass_code), NO_SIGN)
+        self.xy_m = np.zeros((0, 2))
+        self.at, self.at_cov = np.zeros((len(self.sign), 4)), np.zeros((len(self.sign), 4, 4))
+        self.weighted = tracks
+        self.n_rounds, self.is_settled = 0, False
+
+    def run(self) -> None:
+        """Alternate until nothing changes."""
+        if not len(self.sign):
+            self.is_settled = True
+            return
+        self.lay()
+        seen: set[bytes] = set()
+        for self.n_rounds in range(1, MAX_ROUNDS + 1):
+            changed = self.associate()
+            moved = self.solve()
+            is_firm = self.n_rounds > len(LOOSE_M)
+            if is_firm and changed == 0 and moved < SETTLED_M:
+                self.is_settled = True
+                return
+            if is_firm and changed and self.sign.tobytes() in seen:
+                return  # it goes in circles: two associations that are as good as each other
+            seen.add(self.sign.tobytes())
+            if self.n_rounds >= len(LOOSE_M):
+                self.learn()
+
+    def lay(self) -> None:
+        """Lay the passes on each other; those of a single track stay where they say they are."""
+        self.weighted = with_jitter(self.tracks, self.jitter[self.tracks.pass_code])
+        bias, bias_cov = pass_biases(self.weighted, self.passes)
+        xy_m, cov = places(self.weighted, bias, bias_cov)
+        self.nuisance[:, 2:] = bias
+        count = np.diff(self.first)
+        laid = np.flatnonzero(count > 1)
+        rows = np.flatnonzero((count > 1)[self.tracks.pass_code])
+        if laid.size:
+            self.nuisance[laid, :2] = align_passes(
+                xy_m[rows],
+                (cov[rows, 0, 0] + cov[rows, 1, 1]) / 2,
+                self.tracks.class_code[rows],
+                np.concatenate(([0], np.cumsum(count[laid]))),
+                self.passes.gnss_sigma_m[laid],
+                cell_m=100.0,
+            )
+        offset_var = 1 / (1 / np.maximum(self.passes.gnss_sigma_m, 1e-6) ** 2 + np.maximum(count - 1, 0))
+        all_cov = np.zeros((len(count), 4, 4))
+        all_cov[:, 0, 0] = all_cov[:, 1, 1] = offset_var
+        all_cov[:, 2:, 2:] = bias_cov
+        self.at = self.nuisance[self.tracks.pass_code]
+        self.at_cov = all_cov[self.tracks.pass_code]
+
+    def placed(self, tracks: Tracks) -> tuple[Floats, Floats]:
+        """Return where tracks are, offset and bias of their pass taken out as its other tracks know them."""
+        inverse = np.linalg.inv(tracks.matrix[:, :2, :2])
+        slope = inverse @ tracks.matrix[:, :2, 2:]
+        known = np.concatenate((np.broadcast_to(np.eye(2), slope.shape), slope), axis=2)
+        xy_m = tracks.origin_xy_m + np.einsum("tij,tj->ti", inverse, tracks.vector[:, :2])
+        return xy_m - np.einsum("tij,tj->ti", known, self.at), inverse + known @ self.at_cov @ np.swapaxes(known, 1, 2)
+
+    def places(self, loose_m: float = 0.0) -> Places:
+        """Return the tracks as the sweeps see them."""
+        xy_m, cov = self.placed(self.weighted)
+        return Places(
+            np.ascontiguousarray(xy_m),
+            np.column_stack((cov[:, 0, 0] + loose_m**2, cov[:, 1, 1] + loose_m**2, cov[:, 0, 1])),
+            self.tracks.class_code,
+            self.kind,
+            self.tracks.frame_first,
+            self.tracks.frame_last,
+            self.first,
+        )
+
+    def associate(self) -> int:
+        """Assign every pass anew and join what is one; return how many tracks changed their sign."""
+        loose_m = LOOSE_M[self.n_rounds - 1] if self.n_rounds <= len(LOOSE_M) else 0.0
+        here = self.places(loose_m)
+        confusion = self.read.log_confusion
+        before = self.sign
+        found, changed = sweep(here, before, confusion, self.log_prior, birth_cost=self.birth_cost)
+        if self.n_rounds == 1:
+            found, _ = sweep(here, found, confusion, self.log_prior, birth_cost=self.birth_cost)
+        joined = merge(here, found, confusion, self.log_prior, birth_cost=self.birth_cost)
+        self.sign = joined
+        return changed + int(found.max() - joined.max())
+
+    def solve(self) -> float:
+        """Solve for signs and passes; return how far the signs of before have moved at most."""
+        n_signs = int(self.sign.max()) + 1
+        solution = solve(self.weighted, self.passes, self.sign, n_signs, self.nuisance, with_cov=False)
+        before = self.xy_m
+        self.xy_m, self.nuisance = solution.xy_m, solution.nuisance
+        self._look_at_passes()
+        return float(np.abs(before - self.xy_m).max()) if len(before) == len(self.xy_m) else np.inf
+
+    def _look_at_passes(self) -> None:
+        """Find offset and bias of each pass, with covariance, for each of its tracks from all the others."""
+        tracks, code = self.weighted, self.tracks.pass_code
+        sigma = np.column_stack((self.passes.gnss_sigma_m, self.passes.gnss_sigma_m, self.passes.bias_sigma))
+        shift = np.concatenate((self.xy_m[self.sign] - tracks.origin_xy_m, np.zeros((len(code), 2))), axis=1)
+        said = tracks.vector - np.einsum("tij,tj->ti", tracks.matrix, shift)
+        own, right = np.zeros((len(sigma), 4, 4)), np.zeros((len(sigma), 4))
+        np.add.at(own, code, tracks.matrix)
+        np.add.at(right, code, said)
+        root = sigma[code][:, :, None] * np.eye(4)
+        inner = np.eye(4) + root @ (own[code] - tracks.matrix) @ root
+        self.at_cov = root @ np.linalg.solve(inner, root)
+        self.at = np.einsum("tij,tj->ti", self.at_cov, right[code] - said)
+
+    def learn(self) -> None:
+        """Learn recognition and the noise that tracks do not declare."""
+        n_signs = int(self.sign.max()) + 1
+        log_posterior = evidence.class_posterior(self.sign, n_signs, self.tracks.class_code, self.kind, self.read)
+        self.read = evidence.learn_recognition(
+            log_posterior, self.sign, self.tracks.class_code, self.kind, self.fixed_rate, self.is_fixed
+        )
+        self.jitter = self._learn_jitter()
+        self.weighted = with_jitter(self.tracks, self.jitter[self.tracks.pass_code])
+        self._look_at_passes()
+
+    def _learn_jitter(self) -> Floats:
+        """Return the likeliest further error of places, an axis: the fleet's, or its own for a pass that differs."""
+        error, spread, code = self._errors()
+        if not len(code):
+            return self.jitter
+        gain = np.zeros((len(self.passes.gnss_sigma_m), len(JITTERS_M)))
+        for at, tau_m in enumerate(JITTERS_M):
+            s = spread + tau_m**2 * np.eye(2)
+            det = s[:, 0, 0] * s[:, 1, 1] - s[:, 0, 1] ** 2
+            east, north = error.T
+            chi2 = (s[:, 1, 1] * east**2 - 2 * s[:, 0, 1] * east * north + s[:, 0, 0] * north**2) / det
+            gain[:, at] = np.bincount(code, -0.5 * (np.log(det) + chi2), minlength=len(gain))
+        fleet = int(np.argmax(gain.sum(axis=0)))
+        own = np.argmax(gain, axis=1)
+        differs = gain[np.arange(len(gain)), own] > gain[:, fleet] + PASS_JITTER_COST
+        jitter = JITTERS_M[np.where(differs, own, fleet)]
+        jitter[self.n_fleet :] = 0.0
+        return jitter
+
+    def _errors(self) -> tuple[Floats, Floats, Ints]:
+        """Return how far each track lies from what the other passes say of its sign, the covariance, and its pass.
+
+        Without jitter; only tracks of the fleet whose sign another pass reports too.
+        """
+        n_signs, n_passes, code = int(self.sign.max()) + 1, len(self.passes.gnss_sigma_m), self.tracks.pass_code
+        xy_m, cov = self.placed(self.weighted)
+        information: Floats = np.linalg.inv(cov)
+        weighed = np.einsum("tij,tj->ti", information, xy_m)
+        total, moment = _added(information, weighed, self.sign, n_signs)
+        pairs, which = np.unique(self.sign * n_passes + code, return_inverse=True)
+        of_pass, moment_of_pass = _added(information, weighed, which, len(pairs))
+        n_passes_of = np.bincount(pairs // n_passes, minlength=n_signs)
+        used = (n_passes_of[self.sign] > 1) & (code < self.n_fleet)
+        others_cov = np.linalg.inv(total[self.sign[used]] - of_pass[which[used]])
+        others = np.einsum("tij,tj->ti", others_cov, moment[self.sign[used]] - moment_of_pass[which[used]])
+        plain_xy_m, plain_cov = self.placed(self.tracks)
+        return plain_xy_m[used] - others, plain_cov[used] + others_cov, code[used]
+
+    def final(self) -> Solution:
+        """Solve with covariances; a prior map weighs both of its priors by what the fleet says of its translation."""
+        n_signs = int(self.sign.max(initial=-1)) + 1
+        if not self.has_prior or n_signs == 0:
+            return solve(self.weighted, self.passes, self.sign, n_signs, self.nuisance, with_cov=n_signs > 0)
+        tight, wide = (self._solved_with_prior(sigma_m, n_signs) for sigma_m in PRIOR_SHIFT_M)
+        share = _share_of_tight(wide, PRIOR_SHIFT_M)
+
+        def mix(name: str) -> Floats:
+            mixed: Floats = share * getattr(tight, name) + (1 - share) * getattr(wide, name)
+            return mixed
+
+        apart = tight.xy_m - wide.xy_m
+        between = share * (1 - share) * apart[:, :, None] * apart[:, None, :]
+        return replace(tight, xy_m=mix("xy_m"), cov_m2=mix("cov_m2") + between, nuisance=mix("nuisance"))
+
+    def _solved_with_prior(self, sigma_m: float, n_signs: int) -> Solution:
+        """Solve with this standard deviation of the translation of the prior map."""
+        passes = replace(self.passes, gnss_sigma_m=np.append(self.passes.gnss_sigma_m[:-1], sigma_m))
+        return solve(self.weighted, passes, self.sign, n_signs, self.nuisance, with_cov=True, marginal_of=self.n_fleet)
+
+
+def _share_of_tight(wide: Solution, sigmas_m: tuple[float, float]) -> float:
+    """Return the posterior of the tight prior of a map's translation, from the solution under the wide one."""
+    if wide.marginal_cov is None:
+        raise ValueError("the solution lacks the marginal covariance of the prior map")
+    cov = wide.marginal_cov[:2, :2]
+    likely_cov = np.linalg.inv(np.linalg.inv(cov) - np.eye(2) / sigmas_m[1] ** 2)  # what the fleet alone says
+    shift = likely_cov @ np.linalg.solve(cov, wide.nuisance[-1, :2])
+    log_evidence = []
+    for sigma_m in sigmas_m:
+        s = likely_cov + sigma_m**2 * np.eye(2)
+        log_evidence.append(-0.5 * (np.log(np.linalg.det(s)) + shift @ np.linalg.solve(s, shift)))
+    return float(1 / (1 + np.exp(log_evidence[1] - log_evidence[0])))
+
+
+def _added(matrices: Floats, vectors: Floats, group: Ints, n_groups: int) -> tuple[Floats, Floats]:
+    """Return the sums of matrices and vectors over groups."""
+    total, moment = np.zeros((n_groups, 2, 2)), np.zeros((n_groups, 2))
+    np.add.at(total, group, matrices)
+    np.add.at(moment, group, vectors)
+    return total, moment
