@@ -143,7 +143,7 @@ class TrackingConfig(_Section):
 class AggregateConfig(_Section):
     """How detections of many passes become signs."""
 
-    method: Literal["dbscan", "hdbscan", "kmeans", "kmedoids"]
+    method: Literal["dbscan", "hdbscan", "kmeans", "kmedoids", "joint"]
     semantic: Literal["first", "after"]
     eps_m: Positive
     min_samples: Annotated[int, Field(ge=1)]
@@ -154,6 +154,8 @@ class AggregateConfig(_Section):
     min_support: Annotated[int, Field(ge=1)]
     min_support_share: Rate
     correct_bias: Annotated[bool, Off(value=False)]
+    assumed_gnss_sigma_m: Annotated[Positive, Off(2.0)]
+    prior_sigma_m: Annotated[Positive, Off(0.15)]
     tile_zoom: Annotated[int, Field(ge=12, le=20)]
 
 

@@ -242,7 +242,7 @@ class Search:
         """
         n_signs, n_passes, code = int(self.sign.max()) + 1, len(self.passes.gnss_sigma_m), self.tracks.pass_code
         xy_m, cov = self.placed(self.weighted)
-        information: Floats = np.linalg.inv(cov)
+        information = np.asarray(np.linalg.inv(cov), np.float64)
         weighed = np.einsum("tij,tj->ti", information, xy_m)
         total, moment = _added(information, weighed, self.sign, n_signs)
         pairs, which = np.unique(self.sign * n_passes + code, return_inverse=True)

@@ -10,7 +10,15 @@ from typing import Annotated
 import typer
 
 from geofleet.cli.options import N_CORES, AsJson, ConfigFile, Out, OutFolder, Scenario, Settings, Workers, settle
-from geofleet.cli.output import print_evaluation, print_files, print_json, print_result, print_scores, progress_bar
+from geofleet.cli.output import (
+    print_evaluation,
+    print_files,
+    print_json,
+    print_result,
+    print_scores,
+    print_table,
+    progress_bar,
+)
 
 app = typer.Typer()
 
@@ -64,7 +72,7 @@ def aggregate(
     detections: Annotated[Path, typer.Option("--detections", help="A detections table or folder.")],
     out: Out,
     vehicles: Annotated[int | None, typer.Option("--vehicles", help="Use the first V vehicles only.")] = None,
-    method: Annotated[str | None, typer.Option(help="dbscan, hdbscan, kmeans or kmedoids.")] = None,
+    method: Annotated[str | None, typer.Option(help="dbscan, hdbscan, kmeans, kmedoids or joint.")] = None,
     semantic: Annotated[str | None, typer.Option(help="first or after.")] = None,
     eps_m: Annotated[float | None, typer.Option(help="Radius of a neighbourhood.")] = None,
     min_samples: Annotated[int | None, typer.Option(help="Detections that make a core.")] = None,
@@ -72,7 +80,11 @@ def aggregate(
     k: Annotated[int | None, typer.Option("--k", help="Signs of a run: kmeans, kmedoids; 0 = chosen.")] = None,
     k_from: Annotated[Path | None, typer.Option(help="Reference that tells K (an oracle): kmeans, kmedoids.")] = None,
     min_support: Annotated[int | None, typer.Option(help="Passes that a sign needs.")] = None,
-    passes: Annotated[Path | None, typer.Option(help="A passes table: support relative to who saw the place.")] = None,
+    passes: Annotated[Path | None, typer.Option(help="A passes table: who could have seen a place.")] = None,
+    prior: Annotated[Path | None, typer.Option(help="An earlier map, any sign source: joint.")] = None,
+    explain: Annotated[
+        str | None, typer.Option(help="Also list what is behind a sign: joint.", metavar="SIGN_ID")
+    ] = None,
     correct_bias: Annotated[
         bool | None, typer.Option("--correct-bias", help="Take the bias of each pass out first (information form).")
     ] = None,
@@ -110,10 +122,17 @@ def aggregate(
             n_vehicles=vehicles,
             passes=passes,
             k_from=k_from,
+            prior=prior,
             n_workers=workers,
             progress=progress,
         )
-    print_result(result, as_json=as_json)
+    rows = step.explain(out, explain).to_pylist() if explain else None
+    if as_json:
+        print_json({**asdict(result), **({} if rows is None else {"explained": rows})})
+        return
+    print_result(result, as_json=False)
+    if rows is not None:
+        print_table(tuple(rows[0]), [tuple(row.values()) for row in rows])
 
 
 @app.command()

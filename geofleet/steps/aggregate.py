@@ -2,8 +2,8 @@
 
 DuckDB judges the detections, numbers passes and classes and deals them into batches of tiles with their halos; each
 batch is clustered and fused on a thread of its own; what crosses tile borders is joined here. Runs are never mixed.
-Tiles, batches and workers do not show in the result (`algorithms.tiling` says why). K-Means, K-Medoids and HDBSCAN see
-a run as a whole.
+Tiles, batches and workers do not show in the result (`algorithms.tiling` says why). K-Means, K-Medoids, HDBSCAN and
+joint fusion see a run as a whole.
 """
 
 from __future__ import annotations
@@ -20,18 +20,23 @@ import pyarrow.parquet as pq
 
 from geofleet.algorithms.tiling import halo_m
 from geofleet.engines.batches import TileTask, cluster_batch, concatenate, fuse_open, splitter
+from geofleet.engines.joint import JointTask, fuse_run
 from geofleet.engines.local import run_tasks
 from geofleet.engines.whole import RunTask, cluster_run
-from geofleet.errors import ConfigError
+from geofleet.errors import ConfigError, InputError
+from geofleet.formats.layers import read_layer
+from geofleet.tables.biases import BEARING_BIAS_SIGMA_DEG, RANGE_BIAS_SIGMA_M
 from geofleet.tables.database import connect
 from geofleet.tables.dealt import batch_path
 from geofleet.tables.fused import Labels, layer_pieces
 from geofleet.tables.manifest import Hashing, write_manifest
 from geofleet.tables.opportunities import opportunities, read_passes
 from geofleet.tables.reference_counts import reference_counts
-from geofleet.tables.schemas import SIGNS
+from geofleet.tables.schemas import EVIDENCE, NUISANCE, PASSES, SIGNS
 from geofleet.tables.staging import Staged, stage_detections
-from geofleet.tables.store import atomic_path, write_pieces
+from geofleet.tables.store import atomic_path, read_table, write_pieces, write_table
+from geofleet.tables.tracks import Assumed
+from geofleet.tables.tracks_staging import joint_classes, passes_of_run, prior_of_run, stage_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -73,8 +78,8 @@ class AggregateResult:
         lines = [
             (
                 f"{self.n_signs} signs from {self.n_used} of {self.n_detections} detections of {self.n_vehicles} "
-                f"vehicles in {len(self.run_ids)} run(s): {self.n_clusters} clusters in {self.n_tiles} tiles, "
-                f"{self.n_clusters - self.n_signs} with too few passes."
+                f"vehicles in {len(self.run_ids)} run(s): {self.n_clusters} clusters in {self.n_tiles or 'no'} tiles, "
+                f"{self.n_clusters - self.n_signs} with too little support."
             ),
             *self.notes,
         ]
@@ -91,6 +96,7 @@ def aggregate(
     n_vehicles: int | None = None,
     passes: Path | None = None,
     k_from: Path | None = None,
+    prior: Path | None = None,
     n_workers: int = 2,
     progress: Callable[[int, int], None] | None = None,
 ) -> AggregateResult:
@@ -112,6 +118,8 @@ def aggregate(
     k_from
         A `reference` table or any `signs` layer: K-Means and K-Medoids are given its number of signs (of each class,
         semantic first), which no real job knows. The layer's method says `oracle-k`.
+    prior
+        An earlier map, in any format that `read_layer` knows: joint fusion takes its main signs as soft anchors.
     n_workers
         Threads.
     progress
@@ -124,10 +132,23 @@ def aggregate(
     TableError
         A column is missing or mistyped, or the passes are not those of the runs.
     ConfigError
-        K is given twice, for all classes together semantic first, or to a method that has none.
+        K is given twice, for all classes together semantic first, or to a method that has none; a prior map is given
+        to another method than joint.
     """
     settings = config.aggregate
-    label = _label(settings, k_from)
+    label = _label(settings, k_from, prior)
+    if settings.method == "joint":
+        return _fuse_jointly(
+            detections,
+            out,
+            config,
+            label,
+            n_vehicles=n_vehicles,
+            passes=passes,
+            prior=prior,
+            n_workers=n_workers,
+            progress=progress,
+        )
     driven = read_passes(passes) if passes else None
     counts = reference_counts(k_from, semantic=settings.semantic) if k_from else None
     inputs = Hashing(path for path in (detections, passes, k_from) if path)
@@ -166,8 +187,106 @@ def aggregate(
     return result
 
 
-def _label(settings: AggregateConfig, k_from: Path | None) -> str:
+def _fuse_jointly(
+    detections: Path,
+    out: Path,
+    config: Config,
+    label: str,
+    *,
+    n_vehicles: int | None,
+    passes: Path | None,
+    prior: Path | None,
+    n_workers: int,
+    progress: Callable[[int, int], None] | None,
+) -> AggregateResult:
+    """Fuse every run jointly; beside the layer go `<stem>_evidence.parquet` and `<stem>_nuisance.parquet`."""
+    settings = config.aggregate
+    before = read_layer(prior).table if prior else None
+    driven = read_table(PASSES, passes) if passes else None
+    inputs = Hashing(path for path in (detections, passes, prior) if path)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    connection = connect(threads=n_workers, memory_limit=DUCKDB_MEMORY, spatial=False)
+    try:
+        staged = stage_tracks(connection, detections, n_vehicles=n_vehicles or 0)
+        runs, classes = tuple(sorted(staged.judged.fleet)), joint_classes(staged, before)
+        tasks = [
+            JointTask(
+                run_id=run_id,
+                run_code=code,
+                tracks=staged.of_run(run_id),
+                passes=passes_of_run(driven, run_id, n_vehicles) if driven else None,
+                prior=None if before is None else prior_of_run(before, run_id),
+                classes=classes,
+                assumed=Assumed(settings.assumed_gnss_sigma_m, RANGE_BIAS_SIGMA_M, BEARING_BIAS_SIGMA_DEG),
+                prior_sigma_m=settings.prior_sigma_m,
+            )
+            for code, run_id in enumerate(runs)
+        ]
+        found = list(run_tasks(fuse_run, tasks, n_workers=n_workers, progress=progress))
+    finally:
+        connection.close()
+    fleet = {run_id: n_vehicles or reporting for run_id, reporting in staged.judged.fleet.items()}
+    of_run = np.array([fleet[run_id] for run_id in runs], np.int64)
+    clusters = concatenate([one.clusters for one in found])
+    n_signs = write_pieces(
+        SIGNS, layer_pieces(clusters, np.zeros(len(clusters.get("lon", ()))), Labels(runs, classes, of_run, label)), out
+    )
+    for schema, name in ((EVIDENCE, "evidence"), (NUISANCE, "nuisance")):
+        tables = [getattr(one, name) for one in found]
+        write_table(schema, pa.concat_tables(tables) if tables else schema.arrow().empty_table(), beside(out, name))
+    result = AggregateResult(
+        out=out,
+        rejected=_write_rejected(staged.judged.rejected, out),
+        run_ids=runs,
+        n_vehicles=max(fleet.values(), default=0),
+        n_detections=staged.judged.n_detections,
+        n_rejected=staged.judged.rejected.num_rows,
+        n_used=sum(task.tracks.num_rows for task in tasks),
+        n_tiles=0,
+        n_clusters=sum(one.n_candidates for one in found),
+        n_signs=n_signs,
+        notes=_few(staged.judged.fleet, n_vehicles) + tuple(note for one in found for note in one.notes),
+    )
+    _write_manifest(result, inputs, config)
+    return result
+
+
+def beside(out: Path, name: str) -> Path:
+    """Return where the side table of a layer is."""
+    return out.with_name(f"{out.stem}_{name}.parquet")
+
+
+def explain(out: Path, sign_id: str) -> pa.Table:
+    """Return the evidence of a sign of a jointly fused layer: detections, passes, residuals and classes read.
+
+    Raises
+    ------
+    InputError
+        The layer has no evidence beside it, or no such sign.
+    """
+    evidence = read_table(EVIDENCE, beside(out, "evidence"))
+    rows = evidence.filter(pc.equal(evidence["sign_id"], sign_id))
+    if rows.num_rows == 0:
+        raise InputError(
+            f"no detection belongs to a sign {sign_id!r}.",
+            where=str(beside(out, "evidence")),
+            todo="Take a sign_id of the layer; one that only the prior map knows has no detections.",
+        )
+    return rows
+
+
+def _label(settings: AggregateConfig, k_from: Path | None, prior: Path | None) -> str:
     """Return how the layer calls its method; where K came from and whether biases are taken out are part of it."""
+    if prior and settings.method != "joint":
+        raise ConfigError(f"{settings.method} takes no prior map.", where="--prior", todo="Use --method joint.")
+    if settings.method == "joint":
+        if settings.correct_bias or settings.k or k_from:
+            raise ConfigError(
+                "joint fusion solves the bias of each pass itself and takes no K.",
+                where="--correct-bias, --k, --k-from",
+                todo="Leave them out.",
+            )
+        return "joint-prior" if prior else "joint"
     label = f"{settings.method}-{settings.semantic}{'-corrected' * settings.correct_bias}"
     if settings.method not in {"kmeans", "kmedoids"}:
         if k_from or settings.k:
@@ -305,14 +424,18 @@ def _write_rejected(rejected: pa.Table, out: Path) -> Path | None:
 
 def _notes(staged: Staged, n_vehicles: int | None) -> tuple[str, ...]:
     """Return what the user should know beside the counts."""
-    if not staged.fleet:
+    return _few(staged.fleet, n_vehicles) + (staged.bias.notes() if staged.bias else ())
+
+
+def _few(fleet: dict[str, int], n_vehicles: int | None) -> tuple[str, ...]:
+    """Return where fewer vehicles report than were asked for."""
+    if not fleet:
         return ("There are no detections: the layer is empty.",)
-    few = tuple(
+    return tuple(
         f"Run {run_id}: {reporting} of the {n_vehicles} vehicles asked for have detections."
-        for run_id, reporting in staged.fleet.items()
+        for run_id, reporting in fleet.items()
         if n_vehicles and reporting < n_vehicles
     )
-    return few + (staged.bias.notes() if staged.bias else ())
 
 
 def _write_manifest(result: AggregateResult, inputs: Hashing, config: Config) -> None:

@@ -60,7 +60,7 @@ def layer_pieces(clusters: Columns, support: NDArray[np.float64], labels: Labels
     Parameters
     ----------
     clusters
-        As `engines.batches` makes them; with `n_opportunities`, the layer has that column too.
+        As `engines.batches` makes them; with `n_opportunities` or `existence`, the layer has that column too.
     support
         (n,) passes that each cluster needs.
     labels
@@ -99,6 +99,7 @@ def _piece(kept: Columns, names: NDArray[np.bytes_], labels: Labels) -> pa.Table
         "first_seen": _times(kept["t_first_us"], NEVER_BEGUN),
         "last_seen": _times(kept["t_last_us"], NEVER_ENDED),
         **_or_null(kept, ("var_e_m2", "var_n_m2", "cov_en_m2", "class_confidence")),
+        **{name: pa.array(kept[name]) for name in ("existence",) if name in kept},
         **{name: pa.array(kept[name]) for name in ("n_passes", "n_detections", "n_opportunities") if name in kept},
         "run_id": runs,
         "method": labels.method,

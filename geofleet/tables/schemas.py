@@ -258,6 +258,49 @@ DETECTIONS = Schema(
     partitions=("run_id", "vehicle_id"),
 )
 
+EVIDENCE = Schema(
+    "evidence",
+    "what joint fusion made of each detection: its sign, and how far it lies from it",
+    ("run_id", "pass_id", "track_id"),
+    (
+        RUN,
+        _c("pass_id", TEXT, "pass of the detection"),
+        _c("track_id", INT, "number of the detection within the pass"),
+        _c("sign_id", TEXT, "sign that it was associated to, whether that sign is in the map or not"),
+        _c("is_in_map", FLAG, "the sign is in the map: its existence times its class confidence is above one half"),
+        _c("existence", FLOAT, "probability that the sign exists"),
+        _c("sign_class", TEXT, "class of the sign"),
+        _c("read_class", TEXT, "class that the detection reported"),
+        _c(
+            "residual_e_m",
+            FLOAT,
+            "place of the detection, offset and bias of its pass taken out, less the sign's, east",
+        ),
+        _c("residual_n_m", FLOAT, "the same, north"),
+        _c("chi2", FLOAT, "squared residual in standard deviations, two degrees of freedom"),
+    ),
+)
+
+NUISANCE = Schema(
+    "nuisance",
+    "what joint fusion found that all detections of a pass have in common",
+    ("run_id", "pass_id"),
+    (
+        RUN,
+        _c("pass_id", TEXT, "the pass; prior map for the translation of a prior map"),
+        _c("sensor_kind", TEXT, "kind of its sensor"),
+        _c("n_detections", INT, "detections of the pass"),
+        _c("offset_e_m", FLOAT, "offset of the reported path, east"),
+        _c("offset_n_m", FLOAT, "the same, north"),
+        _c("range_bias_m", FLOAT, "what the sensor adds to every range"),
+        _c("bearing_bias_deg", FLOAT, "what sensor and heading add to every bearing, counter-clockwise"),
+        _c("bias_chi2", FLOAT, "offset and biases squared in declared standard deviations, four degrees of freedom"),
+        _c("noise_factor", FLOAT, "factor on the declared variance of its frames, from its own residuals"),
+        _c("jitter_m", FLOAT, "further error of its places an axis, from how they fit the other passes"),
+        _c("is_suspect", FLAG, "far from what it declares: bias_chi2 above 23.5 (1 in 10,000), or noise doubled"),
+    ),
+)
+
 TRUTH = Schema(
     "truth",
     "which sign a simulated detection came from; only evaluation may open it",

@@ -80,14 +80,9 @@ def stage_detections(
         A column is missing or mistyped.
     """
     fine_zoom = max(zoom, FINE_ZOOM)
-    bind_table(connection, DETECTIONS, detections, is_filled=True)
-    create_view(connection, "aggregate/judged")
-    _report_passes(connection)
-    n_rows, n_usable = connection.table("reporting").aggregate("sum(n_rows), sum(n_usable)").fetchall()[0]
-    batch_rows = max(batch_rows, (n_usable or 0) // MAX_BATCHES)
-    materialise(connection, "aggregate/fleet", {"n_vehicles": n_vehicles})
-    materialise(connection, "aggregate/passes")
-    create_view(connection, "aggregate/usable")
+    judge_detections(connection, detections, n_vehicles=n_vehicles)
+    found = judged(connection)
+    batch_rows = max(batch_rows, found.n_detections // MAX_BATCHES)
     bias = correct_passes(connection, detections, passes) if correct_bias else None
     if bias is None:
         create_view(connection, "aggregate/placed")
@@ -100,15 +95,50 @@ def stage_detections(
     materialise(connection, "tiles/leaves", {"zoom": zoom, "fine_zoom": fine_zoom, "batch_rows": batch_rows})
     materialise(connection, "tiles/assign", {"batch_rows": batch_rows})
     _deal(connection, folder, fine_zoom=fine_zoom, halo_m=halo_m)
-    fleet = connection.table("fleet").to_arrow_table()
     return Staged(
         folder=folder,
         tiles=connection.table("assign").to_arrow_table(),
         classes=tuple(connection.table("classes").to_arrow_table()["sign_class"].to_pylist()),
+        fleet=found.fleet,
+        rejected=found.rejected,
+        n_detections=found.n_detections,
+        bias=bias,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What the judgement of all detections found; fields as in `Staged`."""
+
+    fleet: dict[str, int]
+    rejected: pa.Table
+    n_detections: int
+
+
+def judge_detections(connection: duckdb.DuckDBPyConnection, detections: Path, *, n_vehicles: int) -> None:
+    """Make the views and tables `judged`, `reporting`, `copies`, `fleet`, `passes` and `usable` of the detections.
+
+    Raises
+    ------
+    InputError, TableError
+        The table cannot be read, or a column is missing or mistyped.
+    """
+    bind_table(connection, DETECTIONS, detections, is_filled=True)
+    create_view(connection, "aggregate/judged")
+    _report_passes(connection)
+    materialise(connection, "aggregate/fleet", {"n_vehicles": n_vehicles})
+    materialise(connection, "aggregate/passes")
+    create_view(connection, "aggregate/usable")
+
+
+def judged(connection: duckdb.DuckDBPyConnection) -> Judged:
+    """Return what `judge_detections` found."""
+    fleet = connection.table("fleet").to_arrow_table()
+    n_rows, n_usable = connection.table("reporting").aggregate("sum(n_rows), sum(n_usable)").fetchall()[0]
+    return Judged(
         fleet=dict(zip(fleet["run_id"].to_pylist(), fleet["n_reporting"].to_pylist(), strict=True)),
         rejected=_rejected(connection, n_invalid=(n_rows or 0) - (n_usable or 0)),
         n_detections=n_rows or 0,
-        bias=bias,
     )
 
 
