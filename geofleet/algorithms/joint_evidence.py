@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import betaln, gammaln
+from scipy.special import betaln, gammaln, xlogy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,6 +45,8 @@ UNTOLD_CLUTTER = 0.2
 BESIDE_M = 6.0
 STRAY_RATE = 0.003
 """Of the tracks of a sign so many stray beyond every gate, and look like a second sign of its class beside it."""
+LEAST_SHARE = 1e-3
+"""No chance to report a sign is smaller, and none is surer than one minus it."""
 CHANCE_OF_CLUTTER = 1e-3
 """Of a clutter track within the gate of a given place, a pass."""
 
@@ -180,6 +182,7 @@ def _probability(  # noqa: PLR0917
     told = np.isfinite(support.n_chances)
     # where all views are short a pass reports the sign by a smaller chance: P_D times the mean part of a view
     share = rate * np.where(told & (trials > 0), chances / np.maximum(trials, 1.0), 1.0)
+    share = np.clip(share, LEAST_SHARE, 1 - LEAST_SHARE)
     a, b = DETECTION_SPREAD * share, DETECTION_SPREAD * (1 - share)
     missed = np.where(told, trials - n, 0.0)
     sign = betaln(a + n, b + missed) - betaln(a, b)
@@ -189,8 +192,8 @@ def _probability(  # noqa: PLR0917
     once = np.where(n == 1, once, n * np.log(CHANCE_OF_CLUTTER))
     once = np.where(told, once, sign + n * np.log(UNTOLD_CLUTTER / (1 - UNTOLD_CLUTTER)))
     second = SIGN_DENSITY_M2 * np.pi * BESIDE_M**2 / support.n_classes  # expected signs of the class beside another
-    with np.errstate(divide="ignore"):
-        stray = sign + n * np.log(STRAY_RATE * support.n_beside) - gammaln(n + 1) - np.log(second)
+    stray = sign + xlogy(n, STRAY_RATE * support.n_beside) - gammaln(n + 1) - np.log(second)
+    stray[support.n_beside == 0] = -np.inf
     once = np.logaddexp(once, stray)
     in_prior = _is_in_prior(support)
     if support.in_prior is not None:
