@@ -26,12 +26,16 @@ SIGN_DENSITY_M2 = 1e-3
 """Signs a square metre near a road: what a chance partner is weighed against."""
 OTHER_CLASS = 0.01
 """A partner of another class counts this much: a misread class still holds the pass in place."""
+PARTNER_CHI2 = 18.0
+"""A partner further away than this lends no weight."""
 N_ROUNDS = 3
 MOVED_M = 0.25
 NO_POINT = -1
 
 
-def align_passes(xy_m: Floats, var_m2: Floats, class_code: Ints, first: Ints, sigma_m: Floats, cell_m: float) -> Floats:
+def align_passes(
+    xy_m: Floats, var_m2: Floats, class_code: Ints, first: Ints, sigma_m: Floats, *, cell_m: float
+) -> Floats:
     """Return the offset of every pass against their common map, (n_passes, 2).
 
     Parameters
@@ -41,7 +45,7 @@ def align_passes(xy_m: Floats, var_m2: Floats, class_code: Ints, first: Ints, si
     first
         (n_passes + 1,) tracks `first[v]:first[v + 1]` are those of pass v.
     sigma_m
-        (n_passes,) σ an axis of the offset of each pass; the most certain pass with the most tracks comes first.
+        (n_passes,) standard deviation an axis of the offset of each pass; the surest pass with most tracks comes first.
     cell_m
         Passes that share cells as wide are laid one after the other, so that each finds a map where it drove.
     """
@@ -195,7 +199,7 @@ def _gain(  # noqa: PLR0917
             de = xy_m[i, 0] - total[k, 0] / count[k]
             dn = xy_m[i, 1] - total[k, 1] / count[k]
             chi2 = ((de - east) ** 2 + (dn - north) ** 2) / var
-            if chi2 < 18.0:
+            if chi2 < PARTNER_CHI2:
                 density = np.exp(-chi2 / 2) / (2 * np.pi * var * SIGN_DENSITY_M2)
                 if of_class[k] != class_code[i]:
                     density *= OTHER_CLASS

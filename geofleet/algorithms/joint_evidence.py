@@ -45,8 +45,10 @@ UNTOLD_CLUTTER = 0.2
 BESIDE_M = 6.0
 STRAY_RATE = 0.003
 """Of the tracks of a sign so many stray beyond every gate, and look like a second sign of its class beside it."""
+LEAST_ERROR = 1e-6
 LEAST_SHARE = 1e-3
 """No chance to report a sign is smaller, and none is surer than one minus it."""
+MAX_ROUNDS, SETTLED = 50, 1e-6
 CHANCE_OF_CLUTTER = 1e-3
 """Of a clutter track within the gate of a given place, a pass."""
 
@@ -73,7 +75,7 @@ def recognition(error_rate: Floats, n_classes: int, misread: Floats | None = Non
         return Recognition(np.zeros((len(error_rate), 1, 1)), error_rate)
     other = (1 - np.eye(n_classes)) * (1.0 if misread is None else misread)
     other /= other.sum(axis=1, keepdims=True)
-    rate = np.clip(error_rate, 1e-4, 1 - 1e-4)[:, None, None]
+    rate = np.clip(error_rate, LEAST_ERROR, 1 - LEAST_ERROR)[:, None, None]
     return Recognition(np.log((1 - rate) * np.eye(n_classes) + rate * other + 1e-300), error_rate)
 
 
@@ -90,6 +92,7 @@ def learn_recognition(
     sign: Ints,
     class_code: Ints,
     kind_code: Ints,
+    *,
     fixed_rate: Floats,
     is_fixed: NDArray[np.bool_],
 ) -> Recognition:
@@ -157,7 +160,7 @@ def existence(support: Support) -> Existence:
     trials = np.fmax(support.n_in_view, support.n_passes)
     rate, clutter = DETECTION_PRIOR[0] / sum(DETECTION_PRIOR), CLUTTER_PRIOR[0] / CLUTTER_PRIOR[1]
     probability = np.ones(len(n))
-    for _ in range(50):
+    for _ in range(MAX_ROUNDS):
         before = probability
         probability = _probability(support, n, chances, trials, rate, clutter, max(float(before.sum()), 1.0))
         told = np.isfinite(support.n_chances)
@@ -166,7 +169,7 @@ def existence(support: Support) -> Existence:
         )
         single = (n == 1) & ~_is_in_prior(support)
         clutter = (CLUTTER_PRIOR[0] + (1 - probability)[single].sum()) / (CLUTTER_PRIOR[1] + support.n_fleet)
-        if np.abs(probability - before).max(initial=0) < 1e-6:
+        if np.abs(probability - before).max(initial=0) < SETTLED:
             break
     return Existence(probability, float(rate), float(clutter))
 

@@ -37,6 +37,8 @@ PASS_JITTER_COST = 3.0
 PRIOR_SHIFT_M = (0.1, 1.0)
 """Standard deviation an axis of the translation of a prior map as a whole: as a rule, and when it is off;
 each as likely beforehand."""
+AS_READ = 1e-6
+"""Share of misread tracks where nothing can show one."""
 PRIOR_RETYPED = 0.1
 """Share of a prior map's signs that show another class by now."""
 
@@ -89,6 +91,9 @@ class Search:
         self.kind = passes.kind_code[tracks.pass_code]
         self.is_fixed = np.zeros(n_kinds, np.bool_)
         self.fixed_rate = np.full(n_kinds, evidence.ERROR_PRIOR[0] / sum(evidence.ERROR_PRIOR))
+        if not (np.diff(self.first)[:n_fleet] > 1).any():
+            # no pass saw two signs at once: nothing tells a misread sign from two on one pole, so classes stay apart
+            self.is_fixed[:], self.fixed_rate[:] = True, AS_READ
         if self.has_prior:
             self.is_fixed[-1], self.fixed_rate[-1] = True, PRIOR_RETYPED
         self.read = evidence.recognition(self.fixed_rate, n_classes)
@@ -210,7 +215,12 @@ class Search:
         n_signs = int(self.sign.max()) + 1
         log_posterior = evidence.class_posterior(self.sign, n_signs, self.tracks.class_code, self.kind, self.read)
         self.read = evidence.learn_recognition(
-            log_posterior, self.sign, self.tracks.class_code, self.kind, self.fixed_rate, self.is_fixed
+            log_posterior,
+            self.sign,
+            self.tracks.class_code,
+            self.kind,
+            fixed_rate=self.fixed_rate,
+            is_fixed=self.is_fixed,
         )
         self.jitter = self._learn_jitter()
         self.weighted = with_jitter(self.tracks, self.jitter[self.tracks.pass_code])

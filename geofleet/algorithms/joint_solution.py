@@ -1,7 +1,7 @@
 """Places of all signs and the nuisance of all passes at once: sparse normal equations, passes eliminated.
 
-Track i of pass v and sign j measures x = (s_j + g_v, b_v): it adds N_i to the blocks of s_j and of (g_v, b_v). A pass is
-eliminated with G = (P⁻¹ + Σ N)⁻¹, which leaves a system in the signs alone,
+Track i of pass v and sign j measures x = (s_j + g_v, b_v): it adds N_i to the blocks of s_j and of (g_v, b_v). A pass
+is eliminated with G = (P⁻¹ + Σ N)⁻¹, which leaves a system in the signs alone,
 
     Λ = Σ_v [blkdiag(N_pp) - B G Bᵀ]      η = Σ_v [r_p - B G r_v]      s = Λ⁻¹ η      x_v = G (r_v - Bᵀ s)
 
@@ -42,7 +42,7 @@ class Solution:
     xy_m, cov_m2
         (n_signs, 2), (n_signs, 2, 2): places, with the offset that the fleet has in common in the covariance.
     nuisance, nuisance_cov
-        (n_passes, 4), (n_passes, 4, 4): offset east and north, range and bearing bias; the covariance is given the signs.
+        (n_passes, 4), (n_passes, 4, 4): offset east and north, range and bearing bias; covariance given the signs.
     marginal_cov
         (4, 4) covariance of the nuisance of one pass, whatever the signs.
     """
@@ -109,14 +109,15 @@ def solve(
     step = solved[:, 0]
     marginal = None if marginal_of is None else gain[marginal_of] + np.stack(wanted[1:]) @ solved[:, 1:]
     moved = nuisance + np.einsum("vij,vj->vi", gain, right - (coupling @ step).reshape(n_passes, 4))
-    return Solution(start + step.reshape(n_signs, 2), cov, moved, gain, marginal)
+    return Solution(start + step.reshape(n_signs, 2), cov, moved, np.asarray(gain, np.float64), marginal)
 
 
 def _means(xy_m: Floats, weight: Floats, sign: Ints, n_signs: int) -> Floats:
     total, moment = np.zeros((n_signs, 2, 2)), np.zeros((n_signs, 2))
     np.add.at(total, sign, weight)
     np.add.at(moment, sign, np.einsum("tij,tj->ti", weight, xy_m))
-    return np.linalg.solve(total, moment[:, :, None])[:, :, 0]
+    means: Floats = np.asarray(np.linalg.solve(total, moment[:, :, None])[:, :, 0], np.float64)
+    return means
 
 
 def _blocks(blocks: Floats, row: Ints, column: Ints, shape: tuple[int, int]) -> sparse.csr_array:
@@ -132,7 +133,7 @@ def _blocks(blocks: Floats, row: Ints, column: Ints, shape: tuple[int, int]) -> 
 
 
 def _solved(system: sparse.csr_array, right: Floats, *, with_cov: bool) -> tuple[Floats, Floats]:
-    """Solve the symmetric positive definite system; also the 2 × 2 blocks on the diagonal of its inverse."""
+    """Solve the symmetric positive definite system; also the 2 by 2 blocks on the diagonal of its inverse."""
     n = len(right)
     if n <= DENSE_UNKNOWNS:
         factor = linalg.cho_factor(system.toarray(), lower=True, overwrite_a=True, check_finite=False)
@@ -150,8 +151,7 @@ def _solved(system: sparse.csr_array, right: Floats, *, with_cov: bool) -> tuple
         unit = np.zeros((n, stop - begin))
         unit[np.arange(begin, stop), np.arange(stop - begin)] = 1.0
         part = lu.solve(unit)[begin:stop].reshape(-1, 2, stop - begin)
-        at = np.arange((stop - begin) // 2)
-        cov[begin // 2 : stop // 2] = part[
-            at[:, None, None], np.arange(2)[None, :, None], (2 * at[:, None] + [0, 1])[:, None, :]
-        ]
+        sign = np.arange((stop - begin) // 2)[:, None, None]
+        axis = np.arange(2)
+        cov[begin // 2 : stop // 2] = part[sign, axis[None, :, None], 2 * sign + axis]
     return step, cov

@@ -76,9 +76,9 @@ class Passes:
     Parameters
     ----------
     gnss_sigma_m
-        (n,) σ an axis of the offset that a pass adds to every place.
+        (n,) standard deviation an axis of the offset that a pass adds to every place.
     bias_sigma
-        (n, 2) σ of range bias (m) and bearing bias (rad); 0 where there is none.
+        (n, 2) standard deviation of range bias (m) and bearing bias (rad); 0 where there is none.
     kind_code
         (n,) kind of sensor: noise and recognition are learnt a kind.
     """
@@ -153,7 +153,7 @@ def _medians(values: Floats, group: Ints, n_groups: int) -> Floats:
 
 
 def with_jitter(tracks: Tracks, jitter_m: Floats) -> Tracks:
-    """Return the tracks with a further error of their places marginalised in, (n,) σ an axis each, independent.
+    """Return the tracks with a further error of their places marginalised in, `jitter_m` (n,) an axis.
 
     N' = N - N_:p (τ⁻²I + N_pp)⁻¹ N_p:, and r' alike: no track is trusted beyond what its model can promise.
     """
@@ -170,7 +170,7 @@ def pass_biases(tracks: Tracks, passes: Passes) -> tuple[Floats, Floats]:
     """Return range and bearing bias of every pass from its own tracks, (n, 2), and their covariances, (n, 2, 2).
 
     b̂ = (P⁻¹ + Σ S)⁻¹ Σ (r_b - N_bp N_pp⁻¹ r_p), S = N_bb - N_bp N_pp⁻¹ N_pb: what a track still says about the bias
-    once its own place is solved for. A bias of σ 0 stays 0.
+    once its own place is solved for. A bias that the sensor cannot have stays 0.
     """
     n_passes = len(passes.gnss_sigma_m)
     n_bp = tracks.matrix[:, 2:, :2]
@@ -181,7 +181,7 @@ def pass_biases(tracks: Tracks, passes: Passes) -> tuple[Floats, Floats]:
     right = np.zeros((n_passes, 2))
     np.add.at(schur, tracks.pass_code, tracks.matrix[:, 2:, 2:] - n_bp @ solved[:, :, :2])
     np.add.at(right, tracks.pass_code, tracks.vector[:, 2:] - np.einsum("tij,tj->ti", n_bp, solved[:, :, 2]))
-    # (P⁻¹ + S)⁻¹ = D (I + D S D)⁻¹ D with P = D²: also right where a σ is 0
+    # (P⁻¹ + S)⁻¹ = D (I + D S D)⁻¹ D with P = D²: also right where D is 0
     root = passes.bias_sigma[:, :, None] * np.eye(2)
     cov = root @ np.linalg.solve(np.eye(2) + root @ schur @ root, root)
     return np.einsum("vij,vj->vi", cov, right), cov
@@ -228,8 +228,8 @@ def without_fragments(tracks: Tracks, xy_m: Floats, cov: Floats) -> tuple[Tracks
         vector,
         first,
         last,
-        np.bincount(group, tracks.s0, minlength=n_groups),
-        np.bincount(group, tracks.dof, minlength=n_groups),
+        np.bincount(group, tracks.s0, minlength=n_groups).astype(np.float64),
+        np.bincount(group, tracks.dof, minlength=n_groups).astype(np.float64),
     )
     return joined, group
 

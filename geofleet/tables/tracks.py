@@ -28,7 +28,7 @@ INFORMATION = ("info_lon", "info_lat", "info_matrix", "info_vector", "info_s0", 
 
 @dataclass(frozen=True, slots=True)
 class Assumed:
-    """What is taken of a pass that declares nothing: σ an axis of its offset (m), of range (m) and of bearing (deg)."""
+    """What is taken of a pass that declares nothing: standard deviations of its offset, an axis, and of its biases."""
 
     gnss_sigma_m: float
     range_bias_sigma_m: float
@@ -95,7 +95,7 @@ def _or(table: pa.Table, name: str, otherwise: float) -> Floats:
     """Return a column, or what stands for it where it is missing."""
     if name not in table.column_names:
         return np.full(table.num_rows, otherwise)
-    return pc.fill_null(table[name].cast(pa.float64()), otherwise).to_numpy()
+    return np.asarray(pc.fill_null(table[name].cast(pa.float64()), otherwise).to_numpy(), np.float64)
 
 
 def _floats(table: pa.Table, name: str) -> Floats:
