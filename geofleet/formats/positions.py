@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _MAX_LON_DEG, _MAX_LAT_DEG = 180.0, 90.0
 _NULL_ISLAND_DEG, _EMPTY_SEA_DEG = 0.001, 1.5  # no land within 1.5 degrees of 0 N 0 E but for one buoy
 _ALONE_M = 100_000.0
+_ROW_BITS, _ROW_OFFSET = 12, 1024
 _CELL_DEG = 0.1  # places are looked up by cell: the outlines have a margin of three of them
 _AREA_MARGIN_DEG, _ANTARCTIC_DEG = 0.5, -60.0
 
@@ -50,10 +51,10 @@ class PlaceCheck:
         if not len(lon):
             return
         sea = (np.abs(lon) < _EMPTY_SEA_DEG) & (np.abs(lat) < _EMPTY_SEA_DEG)
-        cell = np.floor(np.column_stack((lon, lat)) / _CELL_DEG).astype(np.int64)
-        cells, of_point = np.unique(cell, axis=0, return_inverse=True)
-        x, y = ((cells + 0.5) * _CELL_DEG).T
-        in_cell = np.bincount(of_point.ravel(), minlength=len(cells))
+        column, row = (np.floor(side / _CELL_DEG).astype(np.int64) for side in (lon, lat))
+        cells, in_cell = np.unique((column << _ROW_BITS) + row + _ROW_OFFSET, return_counts=True)
+        x = ((cells >> _ROW_BITS) + 0.5) * _CELL_DEG
+        y = ((cells & ((1 << _ROW_BITS) - 1)) - _ROW_OFFSET + 0.5) * _CELL_DEG
         self._n["all"] += len(lon)
         self._n["guinea"] += int(sea.sum())
         self._n["no land"] += int(in_cell[~_is_on_land(x, y)].sum())
