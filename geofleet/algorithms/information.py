@@ -142,26 +142,38 @@ def _scale(noise: PolarNoise) -> Floats:
 
 
 def pass_bias(seen: FrameDetections, reported: Poses, rows: TrackRows, noise: PolarNoise) -> PassBias:
-    """Return the bias of a pass from its own tracks: b̂ = (P⁻¹ + Σ S)⁻¹ Σ (r_b - N_bp N_pp⁻¹ r_p).
+    """Return the bias of a pass from its own tracks (`bias_posterior`).
 
-    S = N_bb - N_bp N_pp⁻¹ N_pb is what a track still says about the bias once its own place is solved for. Tracks whose
-    residual is beyond `OUTLIER_SIGMAS` are left out: two signs in one track say nothing about the sensor.
+    Tracks whose residual is beyond `OUTLIER_SIGMAS` are left out: two signs in one track say nothing about the sensor.
     """
-    mean, prior = np.zeros(2), noise.bias_cov
-    is_free = np.diag(prior) > 0  # a bias that the vehicle knows to be none stays none
+    mean, cov = np.zeros(2), noise.bias_cov
     long_enough = np.diff(rows.start) >= MIN_FRAMES
-    if not is_free.any() or not long_enough.any():
-        return PassBias(mean, prior)
-    free = np.ix_(is_free, is_free)
-    cov = prior.copy()
+    if not cov.any() or not long_enough.any():
+        return PassBias(mean, cov)
     for _ in range(N_ROUNDS):
         form = information_form(seen, reported, rows, noise, mean)
         used = long_enough & (form.s0 <= form.dof + OUTLIER_SIGMAS * np.sqrt(2 * np.maximum(form.dof, 1)))
-        n_pp, n_pb = form.matrix[used, :2, :2], form.matrix[used, :2, 2:]
-        solved = np.linalg.solve(n_pp, np.concatenate((n_pb, form.vector[used, :2, None]), axis=2))
-        schur = (form.matrix[used, 2:, 2:] - np.swapaxes(n_pb, 1, 2) @ solved[:, :, :2]).sum(axis=0)
-        right = (form.vector[used, 2:] - np.einsum("tij,ti->tj", n_pb, solved[:, :, 2])).sum(axis=0)
-        cov = np.zeros((2, 2))
-        cov[free] = np.linalg.inv(np.linalg.inv(prior[free]) + schur[free])
-        mean = cov @ right
+        schur, right = about_bias(form.matrix[used], form.vector[used])
+        mean, cov = bias_posterior(schur.sum(axis=0), right.sum(axis=0), np.sqrt(np.diag(noise.bias_cov)))
     return PassBias(mean, cov)
+
+
+def about_bias(matrix: Floats, vector: Floats) -> tuple[Floats, Floats]:
+    """Return what tracks, (n, 4, 4) and (n, 4), still say about the bias once their own places are solved for.
+
+    S = N_bb - N_bp N_pp⁻¹ N_pb, (n, 2, 2), and u = r_b - N_bp N_pp⁻¹ r_p, (n, 2). `sql/aggregate/solved` does the same
+    for tables.
+    """
+    n_bp = matrix[:, 2:, :2]
+    solved = np.linalg.solve(matrix[:, :2, :2], np.concatenate((matrix[:, :2, 2:], vector[:, :2, None]), axis=2))
+    return matrix[:, 2:, 2:] - n_bp @ solved[:, :, :2], vector[:, 2:] - np.einsum("tij,tj->ti", n_bp, solved[:, :, 2])
+
+
+def bias_posterior(schur: Floats, right: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    """Return (P⁻¹ + ΣS)⁻¹ Σu, (..., 2), and the covariance (P⁻¹ + ΣS)⁻¹, (..., 2, 2), with P = diag(sigma²).
+
+    Written D (I + D ΣS D)⁻¹ D with P = D², which also holds where a sigma is 0: that bias stays 0.
+    """
+    root = sigma[..., :, None] * np.eye(2)
+    cov = root @ np.linalg.solve(np.eye(2) + root @ schur @ root, root)
+    return (cov @ right[..., None])[..., 0], cov

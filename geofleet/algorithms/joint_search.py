@@ -241,7 +241,7 @@ class Search:
         fleet = int(np.argmax(gain.sum(axis=0)))
         own = np.argmax(gain, axis=1)
         differs = gain[np.arange(len(gain)), own] > gain[:, fleet] + PASS_JITTER_COST
-        jitter = JITTERS_M[np.where(differs, own, fleet)]
+        jitter: Floats = JITTERS_M[np.where(differs, own, fleet)]
         jitter[self.n_fleet :] = 0.0
         return jitter
 

@@ -93,7 +93,7 @@ def solve(
     own[:, np.arange(4), np.arange(4)] += prior
     right = -prior * nuisance
     np.add.at(right, tracks.pass_code, residual)
-    gain = np.linalg.inv(own)
+    gain = np.asarray(np.linalg.inv(own), np.float64)
 
     coupling = _blocks(tracks.matrix[:, :, :2], tracks.pass_code, sign, (n_passes, n_signs))
     diagonal = np.zeros((n_signs, 2, 2))

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
+from geofleet.algorithms.information import about_bias, bias_posterior
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
