@@ -193,7 +193,7 @@ def _probability(  # noqa: PLR0917
     sign = betaln(a + n, b + missed) - betaln(a, b)
     ghost = np.log(GHOSTS_A_SIGN) + betaln(GHOST[0] + n, GHOST[1] + missed) - betaln(*GHOST)
     # singles: as many signs as there are would be seen by one of their passes only, against clutter over all passes
-    once = np.log(clutter * support.n_fleet / n_signs) - np.log(np.maximum(np.where(told, trials, 1.0), 1.0))
+    once = np.log(clutter * max(support.n_fleet, 1) / n_signs) - np.log(np.maximum(np.where(told, trials, 1.0), 1.0))
     once = np.where(n == 1, once, n * np.log(CHANCE_OF_CLUTTER))
     once = np.where(told, once, sign + n * np.log(UNTOLD_CLUTTER / (1 - UNTOLD_CLUTTER)))
     second = SIGN_DENSITY_M2 * np.pi * BESIDE_M**2 / support.n_classes  # expected signs of the class beside another

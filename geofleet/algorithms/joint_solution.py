@@ -81,6 +81,10 @@ def solve(
     prior = 1 / np.maximum(
         np.column_stack((passes.gnss_sigma_m, passes.gnss_sigma_m, passes.bias_sigma)) ** 2, LEAST_VAR
     )
+    if n_signs == 0:
+        return Solution(
+            np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((n_passes, 4)), (1 / prior)[:, :, None] * np.eye(4)
+        )
     # expand about the weighted means of the tracks as they lie now: what is solved for is small
     n_pp = tracks.matrix[:, :2, :2]
     measured = tracks.origin_xy_m - nuisance[tracks.pass_code, :2]
