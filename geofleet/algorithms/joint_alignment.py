@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 CORE_M = 0.5
 """Passes laid on each other fit to this, an axis, beside what their tracks declare."""
 REACH_SIGMAS = 4.0
-GATE_CHI2 = 18.0
-"""A partner further away has no part: 99.99 %, 2 degrees of freedom."""
 SIGN_DENSITY_M2 = 1e-3
 """Signs a square metre near a road: what a chance partner is weighed against."""
 OTHER_CLASS = 0.01

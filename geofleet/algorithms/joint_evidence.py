@@ -51,8 +51,6 @@ LEAST_SHARE = 1e-3
 MAX_ROUNDS, SETTLED = 50, 1e-6
 CHANCE_OF_CLUTTER = 1e-3
 """Of a clutter track within the gate of a given place, a pass."""
-MAX_ROUNDS, SETTLED = 50, 1e-6
-"""Expectation-maximisation ends when no probability moves by more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -171,22 +171,14 @@ def with_jitter(tracks: Tracks, jitter_m: Floats) -> Tracks:
 def pass_biases(tracks: Tracks, passes: Passes) -> tuple[Floats, Floats]:
     """Return range and bearing bias of every pass from its own tracks, (n, 2), and their covariances, (n, 2, 2).
 
-    b̂ = (P⁻¹ + Σ S)⁻¹ Σ (r_b - N_bp N_pp⁻¹ r_p), S = N_bb - N_bp N_pp⁻¹ N_pb: what a track still says about the bias
-    once its own place is solved for. A bias that the sensor cannot have stays 0.
+    A bias that the sensor cannot have stays 0.
     """
     n_passes = len(passes.gnss_sigma_m)
-    n_bp = tracks.matrix[:, 2:, :2]
-    solved = np.linalg.solve(
-        tracks.matrix[:, :2, :2], np.concatenate((tracks.matrix[:, :2, 2:], tracks.vector[:, :2, None]), axis=2)
-    )
-    schur = np.zeros((n_passes, 2, 2))
-    right = np.zeros((n_passes, 2))
-    np.add.at(schur, tracks.pass_code, tracks.matrix[:, 2:, 2:] - n_bp @ solved[:, :, :2])
-    np.add.at(right, tracks.pass_code, tracks.vector[:, 2:] - np.einsum("tij,tj->ti", n_bp, solved[:, :, 2]))
-    # (P⁻¹ + S)⁻¹ = D (I + D S D)⁻¹ D with P = D²: also right where D is 0
-    root = passes.bias_sigma[:, :, None] * np.eye(2)
-    cov = root @ np.linalg.solve(np.eye(2) + root @ schur @ root, root)
-    return np.einsum("vij,vj->vi", cov, right), cov
+    matrix, vector = about_bias(tracks.matrix, tracks.vector)
+    schur, right = np.zeros((n_passes, 2, 2)), np.zeros((n_passes, 2))
+    np.add.at(schur, tracks.pass_code, matrix)
+    np.add.at(right, tracks.pass_code, vector)
+    return bias_posterior(schur, right, passes.bias_sigma)
 
 
 def places(tracks: Tracks, bias: Floats, bias_cov: Floats) -> tuple[Floats, Floats]:
