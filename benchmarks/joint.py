@@ -1,0 +1,231 @@
+"""Measure joint fusion beside DBSCAN, the known association and the Cramér-Rao bound, on simulated fleets.
+
+    .venv/bin/python benchmarks/joint.py bars --drive A --replicates 200
+    .venv/bin/python benchmarks/joint.py prior | robustness | cost
+    .venv/bin/python benchmarks/joint_report.py                      (docs/fusion-results.md and its figures)
+
+Every command adds its figures to `benchmarks/results/joint.json`; fleets are simulated once, into `--fleets`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from joint_cases import PRIOR_CASES, ROBUSTNESS
+from joint_cost import measure_cost
+from joint_fleets import Case, runs, simulated
+from joint_honesty import Honesty, covered
+from joint_maps import (
+    dbscan,
+    joint,
+    known,
+    score_dbscan,
+    score_joint,
+    score_prior,
+    stale_prior,
+)
+
+if TYPE_CHECKING:
+    from geofleet.algorithms.metrics import MapScore
+
+RESULTS = Path(__file__).parent / "results/joint.json"
+VEHICLES = (1, 2, 3, 5, 8, 10, 20, 50)
+KALMAN = {"tracker": "kalman"}
+WITH_PRIOR = (1, 3, 50)
+"""Fleets that are also given a stale prior."""
+NO_MATCH_M = 99.0
+"""Stands for GOSPA_M where nothing matches, in medians."""
+
+
+@dataclass
+class Scores:
+    """Scores of one method on many runs."""
+
+    f1: list[float] = field(default_factory=list)
+    gospa_m: list[float] = field(default_factory=list)
+
+    def add(self, score: MapScore) -> None:
+        """Add a run."""
+        self.f1.append(score.f1 or 0.0)
+        self.gospa_m.append(NO_MATCH_M if score.gospa_m is None else score.gospa_m)
+
+    def summary(self) -> dict[str, float]:
+        """Return the figures that are told."""
+        return {
+            "n": len(self.f1),
+            "f1_mean": float(np.mean(self.f1)),
+            "f1_p1": float(np.quantile(self.f1, 0.01)),
+            "f1_min": float(np.min(self.f1)),
+            "gospa_m_median": float(np.median(self.gospa_m)),
+            "gospa_m_p90": float(np.quantile(self.gospa_m, 0.9)),
+        }
+
+
+class Table(dict[str, Scores]):
+    """Scores by method."""
+
+    def add(self, method: str, score: MapScore) -> None:
+        """Add a run of a method."""
+        self.setdefault(method, Scores()).add(score)
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Return the figures of every method."""
+        return {method: scores.summary() for method, scores in self.items()}
+
+
+def bars(
+    fleets: Path, case: Case, n_replicates: int, n_dbscan: int, vehicles: tuple[int, ...]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Score every method at every fleet size; and how honest joint fusion is about its errors."""
+    honesty = {v: Honesty() for v in vehicles}
+    tables: dict[int, Table] = {v: Table() for v in vehicles}
+    unsettled = dict.fromkeys(vehicles, 0)
+    for number, whole in enumerate(runs(fleets, case, n_replicates)):
+        if number < n_dbscan and number % case.batch == 0:
+            at = simulated(fleets, case, number)
+            informed = case.settings.get("tracker") == "kalman"
+            maps = {
+                (v, corrected): dbscan(at, case, v, corrected=corrected)
+                for v in vehicles
+                for corrected in (False, True)
+                if informed or not corrected
+            }
+        for v in vehicles:
+            run = whole.first_vehicles(v)
+            fused = joint(run)
+            unsettled[v] += not fused.is_settled
+            tables[v].add("joint", score_joint(run, fused))
+            best = known(run)
+            tables[v].add("known", best.score)
+            honesty[v].add(run, fused, best)
+            if v in WITH_PRIOR:
+                prior, judged = stale_prior(run, seed=number)
+                tables[v].add("joint with a stale prior", score_joint(judged, joint(run, prior)))
+                tables[v].add("stale prior alone", score_prior(judged, prior))
+            if number < n_dbscan:
+                for (size, corrected), found in maps.items():
+                    if size == v:
+                        tables[v].add("dbscan corrected" if corrected else "dbscan", score_dbscan(run, found))
+        if (number + 1) % case.batch == 0:
+            for v in vehicles:
+                print(number + 1, v, _short(tables[v].summary()), unsettled[v], honesty[v].summary(), flush=True)
+    scores = {str(v): {**table.summary(), "unsettled": unsettled[v]} for v, table in tables.items()}
+    return scores, {str(v): honesty[v].summary() for v in vehicles}
+
+
+def priors(fleets: Path, case: Case, n_replicates: int, vehicles: tuple[int, ...]) -> dict[str, Any]:
+    """Every fault of a prior alone, and all together, beside the map without it."""
+    found: dict[str, Any] = {}
+    for v in vehicles:
+        tables, shares = {name: Table() for name in PRIOR_CASES}, {name: [] for name in PRIOR_CASES}
+        for number, whole in enumerate(runs(fleets, case, n_replicates)):
+            run = whole.first_vehicles(v)
+            alone = joint(run)
+            for name, how in PRIOR_CASES.items():
+                prior, judged = stale_prior(run, how, seed=number)
+                fused = joint(run, prior)
+                tables[name].add("with", score_joint(judged, fused))
+                tables[name].add("without", score_joint(run, alone))
+                tables[name].add("prior alone", score_prior(judged, prior))
+                shares[name].append(covered(run, fused))
+        found[str(v)] = {
+            name: {**table.summary(), "coverage_90": float(np.nanmean(shares[name]))} for name, table in tables.items()
+        }
+        for name, row in found[str(v)].items():
+            print(v, name, _short(row), round(row["coverage_90"], 3), flush=True)
+    return found
+
+
+def robustness(fleets: Path, name: str, n_replicates: int, vehicles: tuple[int, ...]) -> dict[str, Any]:
+    """Score a hard case beside bias-corrected DBSCAN on the same detections."""
+    case = ROBUSTNESS[name]
+    tables = {v: Table() for v in vehicles}
+    coverage: dict[int, list[float]] = {v: [] for v in vehicles}
+    settled: dict[int, list[bool]] = {v: [] for v in vehicles}
+    for number, whole in enumerate(runs(fleets, case, n_replicates)):
+        if number % case.batch == 0:
+            at = simulated(fleets, case, number)
+            corrected = bool(case.settings.get("send_information", True))
+            maps = {v: dbscan(at, case, v, corrected=corrected) for v in vehicles}
+        for v in vehicles:
+            run = whole.first_vehicles(v)
+            fused = joint(run)
+            tables[v].add("joint", score_joint(run, fused))
+            tables[v].add("known", known(run).score)
+            tables[v].add("dbscan corrected" if corrected else "dbscan", score_dbscan(run, maps[v]))
+            coverage[v].append(covered(run, fused))
+            settled[v].append(fused.is_settled)
+    found = {
+        str(v): {
+            **table.summary(),
+            "coverage_90": float(np.nanmean(coverage[v])),
+            "settled": float(np.mean(settled[v])),
+        }
+        for v, table in tables.items()
+    }
+    for v, row in found.items():
+        print(name, v, _short(row), f"coverage {row['coverage_90']:.2f} settled {row['settled']:.2f}", flush=True)
+    return found
+
+
+def _short(row: dict[str, Any]) -> str:
+    return " | ".join(
+        f"{name}: F1 {s['f1_mean']:.3f} (1 % {s['f1_p1']:.3f}) GM {s['gospa_m_median']:.3f}"
+        for name, s in row.items()
+        if isinstance(s, dict)
+    )
+
+
+def keep(section: str, name: str, figures: Any) -> None:
+    """Put figures into the results, beside those of other commands."""
+    RESULTS.parent.mkdir(exist_ok=True)
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    results.setdefault(section, {})[name] = figures
+    RESULTS.write_text(json.dumps(_rounded(results), indent=1, sort_keys=True) + "\n")
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return round(value, 4) if isinstance(value, float) else value
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("bars", "prior", "robustness", "cost"))
+    parser.add_argument("--fleets", type=Path, default=Path("data/processed/benchmark-fleets"))
+    parser.add_argument("--drive", choices=("A", "B"), default="A")
+    parser.add_argument("--scenario", default="paper-ideal")
+    parser.add_argument("--tracker", default="kalman")
+    parser.add_argument("--replicates", type=int, default=200)
+    parser.add_argument("--dbscan-replicates", type=int, default=20)
+    parser.add_argument("--vehicles", type=int, nargs="+")
+    parser.add_argument("--cases", nargs="*", default=[])
+    given = parser.parse_args()
+    case = Case(given.scenario, given.drive, {"tracker": given.tracker})
+    name = f"{given.scenario}, {given.tracker}, {given.drive}"
+    if given.what == "bars":
+        scores, honesty = bars(
+            given.fleets, case, given.replicates, given.dbscan_replicates, tuple(given.vehicles or VEHICLES)
+        )
+        keep("bars", name, scores)
+        keep("honesty", name, honesty)
+    elif given.what == "prior":
+        keep("prior", name, priors(given.fleets, case, given.replicates, tuple(given.vehicles or (3, 20, 50))))
+    elif given.what == "robustness":
+        sizes = tuple(given.vehicles or (5, 20))
+        for one in given.cases or ROBUSTNESS:
+            keep("robustness", one, robustness(given.fleets, one, given.replicates, sizes))
+    else:
+        keep("cost", "two cores", measure_cost())
+
+
+if __name__ == "__main__":
+    main()

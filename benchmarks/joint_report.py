@@ -1,0 +1,167 @@
+"""Write `docs/fusion-results.md` and its figures from the figures that `benchmarks/joint.py` kept.
+
+    .venv/bin/python benchmarks/joint_report.py [--fleets DIR]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from joint import RESULTS
+from joint_figures import draw_convergence, draw_fleet_sizes, draw_map, draw_reliability
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+DOCS = Path(__file__).parent.parent / "docs"
+HEAD = """# Joint fusion, measured
+
+**All fleets below are simulated** (`benchmarks/joint.py`; this page is written by `benchmarks/joint_report.py` from
+`benchmarks/results/joint.json`). Drive A is the demo's, drive B was not used to develop anything. A map is scored
+against the signs that at least one pass of the fleet reported: what nobody reported is beyond every method. With a
+prior map, signs that it holds count too. Gate 2 m, equal class. *Known association* is the same solver told which
+track is of which sign; it pays for nothing else, so what separates it from the truth is noise and the GNSS offset that
+a fleet has in common. *DBSCAN corrected* is DBSCAN after `--correct-bias`, on the same detections, with the same passes.
+"""
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    head = list(head)
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def _score(of: dict[str, Any] | None, *, best: str = "") -> str:
+    if of is None:
+        return ""
+    gospa_m = "none" if of["gospa_m_median"] > 90 else f"{of['gospa_m_median']:.3f}"  # noqa: PLR2004 - nothing matched
+    return f"{of['f1_mean']:.3f} / {gospa_m}{best}"
+
+
+def _bars(bars: dict[str, Any]) -> str:
+    parts = []
+    for name, by_size in bars.items():
+        rows = []
+        for v in sorted(by_size, key=int):
+            of = by_size[v]
+            ratio = of["joint"]["gospa_m_median"] / of["known"]["gospa_m_median"]
+            rows.append(
+                [
+                    v,
+                    _score(of.get("dbscan")),
+                    _score(of.get("dbscan corrected")),
+                    _score(of["joint"]),
+                    f"{of['joint']['f1_p1']:.3f}",
+                    _score(of["known"]),
+                    f"{ratio:.2f}",
+                    _score(of.get("joint with a stale prior")),
+                    f"{of['unsettled']}",
+                ]
+            )
+        n = next(iter(by_size.values()))
+        others = n.get("dbscan", {}).get("n", 0)
+        head = ("passes", "DBSCAN", "DBSCAN corrected", "**joint**", "1st percentile of F1", "known association", "ratio", "joint, stale prior", "unsettled")
+        parts.append(f"### {name}\n\n{n['joint']['n']} replicates, {others} of DBSCAN. Mean F1 / median GOSPA_M (m).\n\n" + _table(head, rows))
+    return "\n".join(parts)
+
+
+def _honesty(honesty: dict[str, Any]) -> str:
+    rows = []
+    for name, by_size in honesty.items():
+        for v in sorted(by_size, key=int):
+            of = by_size[v]
+            rows.append(
+                [
+                    name,
+                    v,
+                    str(of["n"]),
+                    f"{of['relative_rmse_m']:.3f}",
+                    f"{of['known_rmse_m']:.3f}",
+                    f"{of['bound_m']:.3f}",
+                    f"{of['relative_rmse_m'] / of['bound_m']:.2f}",
+                    f"{of['relative_median_m'] / of['bound_median_m']:.2f}",
+                    f"{of['nees_mean']:.2f}",
+                    f"{100 * of['coverage_90']:.1f} %",
+                    f"{of['brier']:.4f} ({of['brier_of_base_rate']:.4f})",
+                ]
+            )
+    head = ("fleet", "passes", "runs", "relative RMSE (m)", "known association", "bound", "ratio", "ratio of medians", "mean of normalised error squared", "in 90 % ellipse", "Brier (of the base rate)")
+    return _table(head, rows)
+
+
+def _priors(prior: dict[str, Any]) -> str:
+    rows = [
+        [name, v, fault, _score(of["prior alone"]), _score(of["with"]), _score(of["without"]), f"{100 * of['coverage_90']:.0f} %", str(of["with"]["n"])]
+        for name, by_size in prior.items()
+        for v in sorted(by_size, key=int)
+        for fault, of in by_size[v].items()
+    ]
+    return _table(("fleet", "passes", "prior", "prior alone", "joint with it", "joint without", "in 90 % ellipse", "runs"), rows)
+
+
+def _robustness(hard: dict[str, Any]) -> str:
+    rows = [
+        [name, v, _score(of.get("dbscan corrected", of.get("dbscan"))), _score(of["joint"]), _score(of["known"]), f"{100 * of['coverage_90']:.0f} %", str(of["joint"]["n"])]
+        for name, by_size in hard.items()
+        for v, of in sorted(by_size.items(), key=lambda item: int(item[0]))
+    ]
+    return _table(("case", "passes", "DBSCAN corrected", "**joint**", "known association", "in 90 % ellipse", "runs"), rows)
+
+
+def _cost(cost: dict[str, Any]) -> str:
+    rows = [
+        [f"{of['signs']} × {of['passes']}", f"{of['tracks']:,.0f}", f"{of['seconds']:.1f}", f"{of['cpu_seconds']:.1f}", f"{of['peak_mb']:.0f}", f"{of['rounds']:.0f}", "yes" if of["settled"] else "no"]
+        for of in cost["two cores"]
+    ]
+    return _table(("signs × passes", "tracks", "seconds", "of a CPU", "peak (MB)", "rounds", "settled"), rows)
+
+
+def page(results: dict[str, Any]) -> str:
+    """Return the page."""
+    parts = [HEAD]
+    if "bars" in results:
+        parts += ["## Fleet sizes\n", "![Fleet sizes](fusion-fleet-sizes.png)\n", _bars(results["bars"])]
+    if "honesty" in results:
+        parts += [
+            "## Efficiency and honesty\n",
+            "Relative places: the common translation of the map is taken out; the bound is Bayesian, with known association,"
+            " at the information that tracks send. Root of the mean square over all runs; one run that went wrong weighs"
+            " heavily, so the ratio of medians stands beside it. Normalised error squared is 2 when covariances are"
+            " honest.\n",
+            _honesty(results["honesty"]),
+            "![Reliability of existence](fusion-reliability.png)\n",
+            "![Error ellipses](fusion-ellipses.png)\n",
+            "![Convergence](fusion-convergence.png)\n",
+        ]
+    if "prior" in results:
+        parts += ["## Prior maps\n", "Outdated copies as `geofleet stale` makes them, σ 0.15 m. Mean F1 / median GOSPA_M (m).\n", _priors(results["prior"])]
+    if "robustness" in results:
+        parts += [
+            "## Fleets that are not as they say\n",
+            "DBSCAN corrected and joint have the same detections; where they bring means only, DBSCAN has them as they"
+            " are. Mean F1 / median GOSPA_M (m). `benchmarks/joint_cases.py` lists what is set.\n",
+            _robustness(results["robustness"]),
+        ]
+    if "cost" in results:
+        parts += ["## Cost\n", "Made tracks, all in one run, two shared cores (`benchmarks/joint_cost.py`).\n", _cost(results["cost"])]
+    return "\n".join(parts)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--fleets", type=Path, default=Path("data/processed/benchmark-fleets"))
+    fleets = parser.parse_args().fleets
+    results = json.loads(RESULTS.read_text())
+    if "bars" in results:
+        draw_fleet_sizes(results["bars"], DOCS / "fusion-fleet-sizes")
+        draw_reliability(results["honesty"], DOCS / "fusion-reliability")
+    draw_map(fleets, DOCS / "fusion-ellipses")
+    draw_convergence(fleets, DOCS / "fusion-convergence")
+    (DOCS / "fusion-results.md").write_text(page(results))
+
+
+if __name__ == "__main__":
+    main()
