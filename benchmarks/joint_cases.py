@@ -28,14 +28,14 @@ def _case(signs: str = "real", **settings: object) -> Case:
 
 ROBUSTNESS = {
     "as declared": _case(),
-    "σ declared twice too large": _case(declared_sigma_scale=2.0),
-    "σ declared twice too small": _case(declared_sigma_scale=0.5),
+    "sigmas declared twice too large": _case(declared_sigma_scale=2.0),
+    "sigmas declared twice too small": _case(declared_sigma_scale=0.5),
     "misses 25 % of frames": _case(false_negative_rate=0.25),
     "misses 60 % of frames": _case(false_negative_rate=0.6),
     "hidden half of the time": _case(occluded_share=0.5, occlusion_frames=20.0),
     "class read right 80 % of frames": _case(semantic_rate=0.8),
     "class read right for 80 % of tracks": _case(semantic_rate=0.8, semantic_draw="track"),
-    "clutter × 10": _case(ghost_rate_per_ha=0.2),
+    "ten times the clutter": _case(ghost_rate_per_ha=0.2),
     "ghosts that last, 5 a km and pass": _case(ghost_tracks_per_km=5.0),
     "persistent ghosts, 5 a km": _case(billboards_per_km=5.0),
     "half of the tracks split": _case(split_track_rate=0.5),

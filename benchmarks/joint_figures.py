@@ -65,9 +65,18 @@ def draw_reliability(honesty: dict[str, Any], path: Path) -> None:
         for v, colour, mark in (("3", ORANGE, "^"), ("5", VERMILLION, "s"), ("20", BLUE, "o"), ("50", GREEN, "D")):
             if v in honesty.get(name, {}):
                 bins = honesty[name][v]["reliability"]
-                axes.plot([b["stated"] for b in bins], [b["true"] for b in bins], marker=mark, color=colour, label=f"{v} passes", linewidth=1)
+                axes.plot(
+                    [b["stated"] for b in bins],
+                    [b["true"] for b in bins],
+                    marker=mark,
+                    color=colour,
+                    label=f"{v} passes",
+                    linewidth=1,
+                )
                 for b in bins:
-                    axes.annotate(str(b["n"]), (b["stated"], b["true"]), fontsize=6, xytext=(3, 3), textcoords="offset points")
+                    axes.annotate(
+                        str(b["n"]), (b["stated"], b["true"]), fontsize=6, xytext=(3, 3), textcoords="offset points"
+                    )
         axes.set(xlabel="stated probability of existence", ylabel="share that exist")
         axes.legend(fontsize=8)
 
@@ -99,7 +108,9 @@ def draw_convergence(fleets: Path, path: Path) -> None:
                 label = f"{v} passes" if number == 0 else None
                 axes.plot(range(1, len(found) + 1), found, color=colour, linewidth=0.9, marker=".", label=label)
             best = known(run)
-            axes.axhline(_rms(best.xy_m, run, np.ones(len(best.xy_m), bool)), color=colour, linestyle=":", linewidth=0.9)
+            axes.axhline(
+                _rms(best.xy_m, run, np.ones(len(best.xy_m), bool)), color=colour, linestyle=":", linewidth=0.9
+            )
         axes.set(xlabel="round of association", ylabel="error of relative places (m)", yscale="log")
         axes.legend(fontsize=8, title="dotted: known association, last replicate", title_fontsize=7)
 

@@ -11,6 +11,7 @@ from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zlib import crc32
 
 import numpy as np
 import pyarrow as pa
@@ -62,8 +63,8 @@ class Case:
     @property
     def name(self) -> str:
         """A name for its folder."""
-        made = "".join(f"-{key}={value}" for key, value in sorted(self.settings.items()))
-        return f"{self.scenario}-{self.drive}-{self.signs}-{self.n_vehicles}{made}"
+        settings = crc32(repr(sorted(self.settings.items())).encode())
+        return f"{self.scenario}-{self.drive}-{self.signs}-{self.n_vehicles}-{settings:08x}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Whether joint fusion is as good as it says, and as it could be: errors against covariances, existence, and the bound."""
+"""Whether joint fusion is as good as it says, and as it could be: errors, existence, and the bound."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EDGES = np.array([0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0])
 
 
 def errors(run: Run, fused: JointMap) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """Return how far each sign of the map that is one is off, the square in units of its covariance, and which it is."""
+    """Return error of each true sign of the map, its square in units of the covariance, and which sign it is."""
     own = own_sign(run, fused)
     rows = np.flatnonzero(accepted(fused) & (own >= 0))
     error = fused.xy_m[rows] - run.reference_xy[run.reported[own[rows]]]

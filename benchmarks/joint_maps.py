@@ -137,7 +137,7 @@ def stale_prior(run: Run, how: Staleness = STALE, *, seed: int) -> tuple[PriorMa
     )
     held = np.union1d(run.reported, np.flatnonzero(copy.fate[:n] != REMOVED))
     judged = replace(run)
-    judged.__dict__ |= {"reported": held, "fleet": run.fleet, "true_sign": run.true_sign}
+    judged.__dict__.update({"reported": held, "fleet": run.fleet, "true_sign": run.true_sign})
     return prior, judged
 
 
@@ -146,7 +146,9 @@ def score_prior(run: Run, prior: PriorMap) -> MapScore:
     return run.score(prior.xy_m, prior.class_code)
 
 
-def dbscan(folder: Path, case: Case, n_vehicles: int, *, corrected: bool) -> dict[str, tuple[Floats, Floats, list[str]]]:
+def dbscan(
+    folder: Path, case: Case, n_vehicles: int, *, corrected: bool
+) -> dict[str, tuple[Floats, Floats, list[str]]]:
     """Return DBSCAN's maps of a batch of replicates by run: longitude, latitude and class."""
     out = folder / "dbscan.parquet"
     config = load_config(case.scenario, {"method": "dbscan", "correct_bias": corrected})

@@ -1,6 +1,6 @@
 """Write `docs/fusion-results.md` and its figures from the figures that `benchmarks/joint.py` kept.
 
-    .venv/bin/python benchmarks/joint_report.py [--fleets DIR]
+.venv/bin/python benchmarks/joint_report.py [--fleets DIR]
 """
 
 from __future__ import annotations
@@ -24,7 +24,15 @@ HEAD = """# Joint fusion, measured
 against the signs that at least one pass of the fleet reported: what nobody reported is beyond every method. With a
 prior map, signs that it holds count too. Gate 2 m, equal class. *Known association* is the same solver told which
 track is of which sign; it pays for nothing else, so what separates it from the truth is noise and the GNSS offset that
-a fleet has in common. *DBSCAN corrected* is DBSCAN after `--correct-bias`, on the same detections, with the same passes.
+a fleet has in common. *DBSCAN corrected* is DBSCAN after `--correct-bias`, on the same detections and passes.
+"""
+
+HONESTY = """Relative places: the common translation of the map is taken out. The bound is Bayesian, with known
+association, at the information that tracks send. Root of the mean square over all runs, in which one run that went wrong weighs
+heavily; the ratio of medians stands beside it. Normalised error squared is 2 when covariances are honest.
+"""
+HARD = """DBSCAN corrected and joint have the same detections; of means alone DBSCAN takes no bias out.
+Mean F1 / median GOSPA_M (m). `benchmarks/joint_cases.py` lists what is set.
 """
 
 
@@ -63,8 +71,21 @@ def _bars(bars: dict[str, Any]) -> str:
             )
         n = next(iter(by_size.values()))
         others = n.get("dbscan", {}).get("n", 0)
-        head = ("passes", "DBSCAN", "DBSCAN corrected", "**joint**", "1st percentile of F1", "known association", "ratio", "joint, stale prior", "unsettled")
-        parts.append(f"### {name}\n\n{n['joint']['n']} replicates, {others} of DBSCAN. Mean F1 / median GOSPA_M (m).\n\n" + _table(head, rows))
+        head = (
+            "passes",
+            "DBSCAN",
+            "DBSCAN corrected",
+            "**joint**",
+            "1st percentile of F1",
+            "known association",
+            "ratio",
+            "joint, stale prior",
+            "unsettled",
+        )
+        parts.append(
+            f"### {name}\n\n{n['joint']['n']} replicates, {others} of DBSCAN. Mean F1 / median GOSPA_M (m).\n\n"
+            + _table(head, rows)
+        )
     return "\n".join(parts)
 
 
@@ -88,35 +109,76 @@ def _honesty(honesty: dict[str, Any]) -> str:
                     f"{of['brier']:.4f} ({of['brier_of_base_rate']:.4f})",
                 ]
             )
-    head = ("fleet", "passes", "runs", "relative RMSE (m)", "known association", "bound", "ratio", "ratio of medians", "mean of normalised error squared", "in 90 % ellipse", "Brier (of the base rate)")
+    head = (
+        "fleet",
+        "passes",
+        "runs",
+        "relative RMSE (m)",
+        "known association",
+        "bound",
+        "ratio",
+        "ratio of medians",
+        "mean of normalised error squared",
+        "in 90 % ellipse",
+        "Brier (of the base rate)",
+    )
     return _table(head, rows)
 
 
 def _priors(prior: dict[str, Any]) -> str:
     rows = [
-        [name, v, fault, _score(of["prior alone"]), _score(of["with"]), _score(of["without"]), f"{100 * of['coverage_90']:.0f} %", str(of["with"]["n"])]
+        [
+            name,
+            v,
+            fault,
+            _score(of["prior alone"]),
+            _score(of["with"]),
+            _score(of["without"]),
+            f"{100 * of['coverage_90']:.0f} %",
+            str(of["with"]["n"]),
+        ]
         for name, by_size in prior.items()
         for v in sorted(by_size, key=int)
         for fault, of in by_size[v].items()
     ]
-    return _table(("fleet", "passes", "prior", "prior alone", "joint with it", "joint without", "in 90 % ellipse", "runs"), rows)
+    return _table(
+        ("fleet", "passes", "prior", "prior alone", "joint with it", "joint without", "in 90 % ellipse", "runs"), rows
+    )
 
 
 def _robustness(hard: dict[str, Any]) -> str:
     rows = [
-        [name, v, _score(of.get("dbscan corrected", of.get("dbscan"))), _score(of["joint"]), _score(of["known"]), f"{100 * of['coverage_90']:.0f} %", str(of["joint"]["n"])]
+        [
+            name,
+            v,
+            _score(of.get("dbscan corrected", of.get("dbscan"))),
+            _score(of["joint"]),
+            _score(of["known"]),
+            f"{100 * of['coverage_90']:.0f} %",
+            str(of["joint"]["n"]),
+        ]
         for name, by_size in hard.items()
         for v, of in sorted(by_size.items(), key=lambda item: int(item[0]))
     ]
-    return _table(("case", "passes", "DBSCAN corrected", "**joint**", "known association", "in 90 % ellipse", "runs"), rows)
+    return _table(
+        ("case", "passes", "DBSCAN corrected", "**joint**", "known association", "in 90 % ellipse", "runs"), rows
+    )
 
 
 def _cost(cost: dict[str, Any]) -> str:
     rows = [
-        [f"{of['signs']} × {of['passes']}", f"{of['tracks']:,.0f}", f"{of['seconds']:.1f}", f"{of['cpu_seconds']:.1f}", f"{of['peak_mb']:.0f}", f"{of['rounds']:.0f}", "yes" if of["settled"] else "no"]
+        [
+            f"{of['signs']} by {of['passes']}",
+            f"{of['tracks']:,.0f}",
+            f"{of['seconds']:.1f}",
+            f"{of['cpu_seconds']:.1f}",
+            f"{of['peak_mb']:.0f}",
+            f"{of['rounds']:.0f}",
+            "yes" if of["settled"] else "no",
+        ]
         for of in cost["two cores"]
     ]
-    return _table(("signs × passes", "tracks", "seconds", "of a CPU", "peak (MB)", "rounds", "settled"), rows)
+    return _table(("signs by passes", "tracks", "seconds", "of a CPU", "peak (MB)", "rounds", "settled"), rows)
 
 
 def page(results: dict[str, Any]) -> str:
@@ -127,26 +189,30 @@ def page(results: dict[str, Any]) -> str:
     if "honesty" in results:
         parts += [
             "## Efficiency and honesty\n",
-            "Relative places: the common translation of the map is taken out; the bound is Bayesian, with known association,"
-            " at the information that tracks send. Root of the mean square over all runs; one run that went wrong weighs"
-            " heavily, so the ratio of medians stands beside it. Normalised error squared is 2 when covariances are"
-            " honest.\n",
+            HONESTY,
             _honesty(results["honesty"]),
             "![Reliability of existence](fusion-reliability.png)\n",
             "![Error ellipses](fusion-ellipses.png)\n",
             "![Convergence](fusion-convergence.png)\n",
         ]
     if "prior" in results:
-        parts += ["## Prior maps\n", "Outdated copies as `geofleet stale` makes them, σ 0.15 m. Mean F1 / median GOSPA_M (m).\n", _priors(results["prior"])]
+        parts += [
+            "## Prior maps\n",
+            "Outdated copies as `geofleet stale` makes them, sigma 0.15 m. Mean F1 / median GOSPA_M (m).\n",
+            _priors(results["prior"]),
+        ]
     if "robustness" in results:
         parts += [
             "## Fleets that are not as they say\n",
-            "DBSCAN corrected and joint have the same detections; where they bring means only, DBSCAN has them as they"
-            " are. Mean F1 / median GOSPA_M (m). `benchmarks/joint_cases.py` lists what is set.\n",
+            HARD,
             _robustness(results["robustness"]),
         ]
     if "cost" in results:
-        parts += ["## Cost\n", "Made tracks, all in one run, two shared cores (`benchmarks/joint_cost.py`).\n", _cost(results["cost"])]
+        parts += [
+            "## Cost\n",
+            "Made tracks, all in one run, two shared cores (`benchmarks/joint_cost.py`).\n",
+            _cost(results["cost"]),
+        ]
     return "\n".join(parts)
 
 

@@ -36,6 +36,9 @@ SPOILT_RATIO = 4.0
 FRAGMENT_CHI2 = 13.8
 """Fragments of one pass whose places differ by less (99.9 %, 2 degrees of freedom) are one track."""
 FRAGMENT_REACH_M = 15.0
+UNKNOWNS = 4
+"""That a track solves for: two measurements a frame, less these, are its degrees of freedom."""
+SYSTEMATIC_SHARE = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,9 +114,10 @@ def tracks_of_means(
     frames = np.fmax(n_frames, 1.0)
     known = np.isfinite(spread[:, :2]).all(axis=1)
     cov = np.zeros((len(xy_m), 2, 2))
-    cov[:, 0, 0] = np.where(known, spread[:, 0], SPREAD_M**2) / frames + FLOOR_M**2
-    cov[:, 1, 1] = np.where(known, spread[:, 1], SPREAD_M**2) / frames + FLOOR_M**2
-    cov[:, 0, 1] = cov[:, 1, 0] = np.where(known & np.isfinite(spread[:, 2]), spread[:, 2], 0.0) / frames
+    share = 1 / frames + SYSTEMATIC_SHARE
+    cov[:, 0, 0] = np.where(known, spread[:, 0], SPREAD_M**2) * share + FLOOR_M**2
+    cov[:, 1, 1] = np.where(known, spread[:, 1], SPREAD_M**2) * share + FLOOR_M**2
+    cov[:, 0, 1] = cov[:, 1, 0] = np.where(known & np.isfinite(spread[:, 2]), spread[:, 2], 0.0) * share
     is_viewed = np.isfinite(range_m) & np.isfinite(azimuth_rad)
     east, north = np.cos(np.where(is_viewed, azimuth_rad, 0.0)), np.sin(np.where(is_viewed, azimuth_rad, 0.0))
     reach = np.where(is_viewed, range_m, 0.0)
@@ -197,6 +201,9 @@ def places(tracks: Tracks, bias: Floats, bias_cov: Floats) -> tuple[Floats, Floa
 def without_fragments(tracks: Tracks, xy_m: Floats, cov: Floats) -> tuple[Tracks, Ints]:
     """Join tracks of a pass that have one class, never share a frame and whose places agree: they are one sign.
 
+    Where two tracks span the same frames and each was seen in a part of them, so that both parts have room in one
+    frame after the other, they took turns: a gate that is too narrow for the noise makes two tracks of one sign so.
+
     Returns
     -------
     The joined tracks, and the joined track of each row given, (n,).
@@ -229,14 +236,24 @@ def without_fragments(tracks: Tracks, xy_m: Floats, cov: Floats) -> tuple[Tracks
 
 
 def _fragments(tracks: Tracks, xy_m: Floats, cov: Floats) -> Ints:
+    frames = np.where(tracks.dof > 0, (tracks.dof + UNKNOWNS) / 2, np.inf)
+    density = np.minimum(frames / (tracks.frame_last - tracks.frame_first + 1), 1.0)
     group: Ints = _join(
-        tracks.pass_code, tracks.class_code, tracks.frame_first, tracks.frame_last, np.ascontiguousarray(xy_m), cov
+        tracks.pass_code,
+        tracks.class_code,
+        tracks.frame_first,
+        tracks.frame_last,
+        density,
+        np.ascontiguousarray(xy_m),
+        cov,
     )
     return np.unique(group, return_inverse=True)[1].astype(np.int64)
 
 
 @njit(cache=True, nogil=True)
-def _join(pass_code: Ints, class_code: Ints, first: Ints, last: Ints, xy_m: Floats, cov: Floats) -> Ints:  # noqa: PLR0917
+def _join(  # noqa: PLR0917
+    pass_code: Ints, class_code: Ints, first: Ints, last: Ints, density: Floats, xy_m: Floats, cov: Floats
+) -> Ints:
     """Return the group of each track, named by its first row; rows of a pass stand together."""
     n = len(pass_code)
     group = np.arange(n)
@@ -251,16 +268,17 @@ def _join(pass_code: Ints, class_code: Ints, first: Ints, last: Ints, xy_m: Floa
                 en = cov[i, 0, 1] + cov[j, 0, 1]
                 chi2 = (nn * east * east - 2 * en * east * north + ee * north * north) / (ee * nn - en * en)
                 is_near = east * east + north * north < FRAGMENT_REACH_M**2 and chi2 < FRAGMENT_CHI2
-                if is_near and _is_apart(group, first, last, i, j):
+                if is_near and _is_apart(group, first, last, density, i, j):
                     group[j] = i
             j += 1
     return group
 
 
 @njit(cache=True, nogil=True)
-def _is_apart(group: Ints, first: Ints, last: Ints, lead: int, other: int) -> bool:
-    """Return whether a track shares no frame with any member of the group of `lead`."""
+def _is_apart(group: Ints, first: Ints, last: Ints, density: Floats, lead: int, other: int) -> bool:  # noqa: PLR0917
+    """Return whether a track likely shares no frame with any member of the group of `lead`."""
     for k in range(lead, other):
-        if group[k] == lead and first[k] <= last[other] and first[other] <= last[k]:
+        is_during = first[k] <= last[other] and first[other] <= last[k]
+        if group[k] == lead and is_during and density[k] + density[other] > 1.0:
             return False
     return True
