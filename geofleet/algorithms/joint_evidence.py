@@ -23,8 +23,10 @@ SIGN_DENSITY_M2 = 1e-3
 """Signs a square metre beside a road: one every 30 m on either side, within 15 m."""
 ERROR_PRIOR = (2.0, 38.0)
 """Beta prior of the share of misread tracks: 5 %, worth forty tracks."""
-CONFUSION_PRIOR = 1.0
-"""Dirichlet prior of what a misread class is taken for: as much for each other class, worth this many misreadings."""
+CONFUSION_PRIOR = 20.0
+"""Dirichlet prior of what a misread class is taken for: as much for each other class, worth this many misreadings.
+
+A weak one believes itself: a single track against a retyped sign of the prior map becomes the usual misreading."""
 DETECTION_PRIOR = (18.0, 2.0)
 """Beta prior of P_D, the chance that a pass that had a sign in view reports it: 90 %, worth twenty chances."""
 DETECTION_SPREAD = 20.0
@@ -70,11 +72,14 @@ class Recognition:
 
 
 def recognition(error_rate: Floats, n_classes: int, misread: Floats | None = None) -> Recognition:
-    """Return the confusion of sensors that misread so often, as `misread` (n_classes, n_classes) or any class alike."""
+    """Return the confusion of sensors that misread so often, as `misread` or any class alike.
+
+    `misread` (n_kinds, n_classes, n_classes) says what each class is taken for when it is misread, up to a factor.
+    """
     if n_classes == 1:
         return Recognition(np.zeros((len(error_rate), 1, 1)), error_rate)
-    other = (1 - np.eye(n_classes)) * (1.0 if misread is None else misread)
-    other /= other.sum(axis=1, keepdims=True)
+    other = (1 - np.eye(n_classes)) * (np.ones((1, n_classes, n_classes)) if misread is None else misread)
+    other /= other.sum(axis=2, keepdims=True)
     rate = np.clip(error_rate, LEAST_ERROR, 1 - LEAST_ERROR)[:, None, None]
     return Recognition(np.log((1 - rate) * np.eye(n_classes) + rate * other + 1e-300), error_rate)
 
@@ -113,7 +118,8 @@ def learn_recognition(
     np.add.at(expected.T, class_code[learnt], posterior[learnt])
     np.fill_diagonal(expected, 0.0)
     misread = (expected + CONFUSION_PRIOR / (n_classes - 1)) / (expected.sum(axis=1, keepdims=True) + CONFUSION_PRIOR)
-    return recognition(np.where(is_fixed, fixed_rate, rate), n_classes, misread)
+    of_kind = np.where(is_fixed[:, None, None], 1.0, misread)
+    return recognition(np.where(is_fixed, fixed_rate, rate), n_classes, of_kind)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -35,8 +35,9 @@ PASS_JITTER_COST = 3.0
 
 
 PRIOR_SHIFT_M = (0.1, 1.0)
-"""Standard deviation an axis of the translation of a prior map as a whole: as a rule, and when it is off;
-each as likely beforehand."""
+"""Standard deviation an axis of the translation of a prior map as a whole: as a rule, and when it is off."""
+PRIOR_IS_OFF = 0.2
+"""Probability beforehand that it is off."""
 AS_READ = 1e-6
 """Share of misread tracks where nothing can show one."""
 PRIOR_RETYPED = 0.1
@@ -297,7 +298,8 @@ def _share_of_tight(wide: Solution, sigmas_m: tuple[float, float]) -> float:
     for sigma_m in sigmas_m:
         s = likely_cov + sigma_m**2 * np.eye(2)
         log_evidence.append(-0.5 * (np.log(np.linalg.det(s)) + shift @ np.linalg.solve(s, shift)))
-    return float(1 / (1 + np.exp(log_evidence[1] - log_evidence[0])))
+    odds = PRIOR_IS_OFF / (1 - PRIOR_IS_OFF)
+    return float(1 / (1 + odds * np.exp(log_evidence[1] - log_evidence[0])))
 
 
 def _added(matrices: Floats, vectors: Floats, group: Ints, n_groups: int) -> tuple[Floats, Floats]:

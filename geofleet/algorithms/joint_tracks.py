@@ -38,7 +38,6 @@ FRAGMENT_CHI2 = 13.8
 FRAGMENT_REACH_M = 15.0
 UNKNOWNS = 4
 """That a track solves for: two measurements a frame, less these, are its degrees of freedom."""
-SYSTEMATIC_SHARE = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,10 +113,9 @@ def tracks_of_means(
     frames = np.fmax(n_frames, 1.0)
     known = np.isfinite(spread[:, :2]).all(axis=1)
     cov = np.zeros((len(xy_m), 2, 2))
-    share = 1 / frames + SYSTEMATIC_SHARE
-    cov[:, 0, 0] = np.where(known, spread[:, 0], SPREAD_M**2) * share + FLOOR_M**2
-    cov[:, 1, 1] = np.where(known, spread[:, 1], SPREAD_M**2) * share + FLOOR_M**2
-    cov[:, 0, 1] = cov[:, 1, 0] = np.where(known & np.isfinite(spread[:, 2]), spread[:, 2], 0.0) * share
+    cov[:, 0, 0] = np.where(known, spread[:, 0], SPREAD_M**2) / frames + FLOOR_M**2
+    cov[:, 1, 1] = np.where(known, spread[:, 1], SPREAD_M**2) / frames + FLOOR_M**2
+    cov[:, 0, 1] = cov[:, 1, 0] = np.where(known & np.isfinite(spread[:, 2]), spread[:, 2], 0.0) / frames
     is_viewed = np.isfinite(range_m) & np.isfinite(azimuth_rad)
     east, north = np.cos(np.where(is_viewed, azimuth_rad, 0.0)), np.sin(np.where(is_viewed, azimuth_rad, 0.0))
     reach = np.where(is_viewed, range_m, 0.0)
