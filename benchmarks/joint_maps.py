@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 from joint_fleets import SEED, Run
 
@@ -123,19 +124,20 @@ def own_sign(run: Run, fused: JointMap) -> Ints:
 
 
 def stale_prior(run: Run, how: Staleness = STALE, *, seed: int) -> tuple[PriorMap, Run]:
-    """Return an outdated map of the scene, and the run scored against what was reported or the prior holds."""
-    lon, lat = lonlat(run.reference)
-    keys = sign_keys(run.reference["sign_id"].to_pylist())
-    copy = make_stale(keys, lon, lat, run.reference_code, how, seed=SEED + seed)
+    """Return an outdated map of the signs in view, and the run scored against what was reported or the prior holds."""
+    rows = np.flatnonzero(run.reference["n_passes_in_view"].to_numpy() > 0)  # of the largest fleet
+    scene, code = run.reference.take(pa.array(rows)), run.reference_code[rows]
+    lon, lat = lonlat(scene)
+    copy = make_stale(sign_keys(scene["sign_id"].to_pylist()), lon, lat, code, how, seed=SEED + seed)
     n = len(lon)
     there = np.append(copy.fate != REMOVED, np.ones(len(copy.key), bool))
     prior = PriorMap(
         run.frame.to_enu(copy.lon_deg, copy.lat_deg)[there],
         np.full(int(there.sum()), how.sigma_m),
-        run.reference_code[copy.class_of][there],
+        code[copy.class_of][there],
         np.zeros((int(there.sum()), 2)),
     )
-    held = np.union1d(run.reported, np.flatnonzero(copy.fate[:n] != REMOVED))
+    held = np.union1d(run.reported, rows[copy.fate[:n] != REMOVED])
     judged = replace(run)
     judged.__dict__.update({"reported": held, "fleet": run.fleet, "true_sign": run.true_sign})
     return prior, judged

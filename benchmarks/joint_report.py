@@ -28,8 +28,8 @@ a fleet has in common. *DBSCAN corrected* is DBSCAN after `--correct-bias`, on t
 """
 
 HONESTY = """Relative places: the common translation of the map is taken out. The bound is Bayesian, with known
-association, at the information that tracks send. Root of the mean square over all runs, in which one run that went wrong weighs
-heavily; the ratio of medians stands beside it. Normalised error squared is 2 when covariances are honest.
+association, at the information that tracks send. Root of the mean square over all runs, in which one run that went
+wrong weighs heavily; the ratio of medians stands beside it. Normalised error squared is 2 when covariances are honest.
 """
 HARD = """DBSCAN corrected and joint have the same detections; of means alone DBSCAN takes no bias out.
 Mean F1 / median GOSPA_M (m). `benchmarks/joint_cases.py` lists what is set.
