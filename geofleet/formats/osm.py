@@ -40,7 +40,7 @@ def read_signs(path: Path, *, roads: bool = True) -> LayerStream:
     nodes, ways = scan(path, lambda pbf: (sign_nodes(pbf), read_roads(pbf) if roads else None))
     if not nodes.spool.n_nodes:
         refuse_lanelet2(path)
-    rows = SignRows(nodes, source=path.name, roads=ways)
+    rows = SignRows(nodes, path=path, roads=ways)
     return LayerStream(rows.pieces, FORMAT, rows.skipped, rows.found)
 
 

@@ -21,6 +21,7 @@ from geofleet.tables.store import arrow_numbers, arrow_texts, build_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -106,16 +107,16 @@ class SignRows:
     ----------
     nodes
         Nodes and their tags.
-    source
-        Name of the file.
+    path
+        The file.
     roads
         Drivable ways, which give each sign a road and, where its tags do not say, a facing.
     """
 
-    def __init__(self, nodes: SignNodes, *, source: str, roads: Roads | None = None) -> None:
+    def __init__(self, nodes: SignNodes, *, path: Path, roads: Roads | None = None) -> None:
         self.skipped: dict[str, int] = {}
         self.found: dict[str, int] = {}
-        self._nodes, self._source, self._roads = nodes, source, roads
+        self._nodes, self._path, self._roads = nodes, path, roads
         self._tags = TagSigns(nodes.tagsets)
 
     def pieces(self) -> Iterator[pa.Table]:
@@ -129,7 +130,7 @@ class SignRows:
             self.found.update({INFERRED: 0, NO_ROAD: 0, EDGE: self._roads.n_missing_nodes})
             index = RoadIndex(self._roads)
         twice = _mapped_twice(self._nodes.spool, self._tags)
-        check = PlaceCheck(self._source)
+        check = PlaceCheck(str(self._path))
         n_pieces = 0
         for nodes in self._nodes.spool.in_text_order():
             kept = self._kept(nodes, twice)
@@ -174,7 +175,7 @@ class SignRows:
             "parent_id": pc.binary_join_element_wise(support, taken["parent_id"], _HYPHEN),
             "facing_deg": stated,
             "support_id": support,
-            "source": self._source,
+            "source": self._path.name,
             "source_ref": _headed("node/", number),
         }
         if index is not None:
