@@ -54,7 +54,7 @@ class Signs(NamedTuple):
 
 
 class _Grid(NamedTuple):
-    """Signs filed by cells that some track lies in."""
+    """Signs filed by cells that some track lies in or beside."""
 
     keys: Ints  # sorted
     head: Ints  # first sign of each cell
@@ -106,7 +106,8 @@ def _grid(xy_m: Floats) -> _Grid:
     low = xy_m.min(axis=0) - 2 * REACH_M
     cell = np.floor((xy_m - low) / REACH_M).astype(np.int64)
     width = int(cell[:, 0].max()) + 3
-    keys = np.unique(cell[:, 1] * width + cell[:, 0])
+    around = np.array([row * width + column for row in (-1, 0, 1) for column in (-1, 0, 1)])
+    keys = np.unique((cell[:, 1] * width + cell[:, 0])[:, None] + around)  # the mean of tracks may lie a cell on
     return _Grid(keys, np.full(len(keys), NO_SIGN), low, width)
 
 
@@ -203,9 +204,8 @@ def _place(signs: Signs, k: int) -> tuple[float, float, float, float, float]:
 
 
 @njit(cache=True, nogil=True)
-def _cell_of(grid: _Grid, east: float, north: float) -> int:
-    column = int(np.floor((east - grid.low[0]) / REACH_M))
-    row = int(np.floor((north - grid.low[1]) / REACH_M))
+def _cell_of(grid: _Grid, column: int, row: int) -> int:
+    """Return the number of a cell, -1 far from all tracks."""
     key = row * grid.width + column
     at = np.searchsorted(grid.keys, key)
     return int(at) if at < grid.keys.size and grid.keys[at] == key else -1
@@ -213,7 +213,7 @@ def _cell_of(grid: _Grid, east: float, north: float) -> int:
 
 @njit(cache=True, nogil=True)
 def _file(signs: Signs, grid: _Grid, k: int) -> None:
-    """File a sign under the cell of its place; in a cell where no track lies, under the nearest file there is."""
+    """File a sign under the cell of its place; far from all tracks, under the nearest file there is."""
     east, north, _, _, _ = _place(signs, k)
     column = int(np.floor((east - grid.low[0]) / REACH_M))
     row = int(np.floor((north - grid.low[1]) / REACH_M))
@@ -302,9 +302,11 @@ def _assign_pass(  # noqa: PLR0917 - numba takes no keyword-only arguments
 def _signs_around(grid: _Grid, signs: Signs, xy_m: Floats) -> list[int]:
     """Return the signs with tracks that are filed in the cells around a place."""
     around = [0 for _ in range(0)]
+    column = int(np.floor((xy_m[0] - grid.low[0]) / REACH_M))  # floored once: neighbours are whole steps away
+    row = int(np.floor((xy_m[1] - grid.low[1]) / REACH_M))
     for d_row in range(-1, 2):
         for d_column in range(-1, 2):
-            at = _cell_of(grid, xy_m[0] + d_column * REACH_M, xy_m[1] + d_row * REACH_M)
+            at = _cell_of(grid, column + d_column, row + d_row)
             k = grid.head[at] if at >= 0 else NO_SIGN
             while k != NO_SIGN:
                 if signs.n_tracks[k] > 0:

@@ -48,7 +48,8 @@ def merge(places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, 
     owner = np.repeat(np.arange(len(places.first) - 1), np.diff(places.first))
     n_both, n_lonely = _passes_of_pairs(one, two, by_sign, start, owner, places)
     saved += MISSED_NATS * n_lonely - birth_cost * n_both
-    worth = np.flatnonzero(saved > 0)
+    # a track that would be cast out must be outweighed by passes that report the rarer place alone
+    worth = np.flatnonzero((saved > 0) & ((n_both == 0) | (n_lonely > n_both)))
     order = worth[np.argsort(-saved[worth], kind="stable")]
     root: Ints = _join_once(one[order], two[order], n_signs)
     joined: Ints = np.unique(root[sign], return_inverse=True)[1].astype(np.int64)

@@ -147,7 +147,6 @@ def test_without_noise_the_map_is_exact() -> None:
     assert (found.n_passes == 8).all()
 
 
-@pytest.mark.xfail(reason="a track on the edge of a cell searches two cells on, and misses the sign in the next")
 def test_a_track_on_the_edge_of_a_cell_keeps_its_sign() -> None:
     """Signs 25 m apart put tracks 15 cells of 15 m from the least one, where rounding decides which cell it is."""
     _, _, tracks = fleet()
