@@ -102,6 +102,7 @@ def aggregate(
     *,
     method: str = "dbscan",
     semantic: str = "first",
+    prior: GeoDataFrame | None = None,
     passes: GeoDataFrame | None = None,
     n_vehicles: int | None = None,
     **overrides: Any,
@@ -109,12 +110,12 @@ def aggregate(
     """Cluster detections and fuse them into a sign map; any key of a scenario may be overridden, e.g. `eps_m=3`.
 
     With `passes`, support is relative to the passes that had a place in view; with `correct_bias=True`, the bias of
-    each pass is taken out first.
+    each pass is taken out first. `method="joint"` takes `passes` as evidence of what was not seen, and a `prior` map.
 
     Raises
     ------
     ConfigError
-        A key is unknown, or a value is out of range.
+        A key is unknown, a value is out of range, or a prior map is given to another method than joint.
     TableError
         A column is missing or mistyped.
     """
@@ -125,7 +126,10 @@ def aggregate(
         driven = Path(folder) / "passes.parquet" if passes is not None else None
         if driven:
             write_table(PASSES, from_geodataframe(PASSES, passes), driven)
-        aggregate_step.aggregate(source, out, config=config, n_vehicles=n_vehicles, passes=driven)
+        before = Path(folder) / "prior.parquet" if prior is not None else None
+        if before:
+            write_table(SIGNS, from_geodataframe(SIGNS, prior), before)
+        aggregate_step.aggregate(source, out, config=config, n_vehicles=n_vehicles, passes=driven, prior=before)
         return _read(SIGNS, out)
 
 
