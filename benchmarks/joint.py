@@ -104,7 +104,7 @@ def bars(
             tables[v].add("known", best.score)
             honesty[v].add(run, fused, best)
             if v in WITH_PRIOR:
-                prior, judged = stale_prior(run, seed=number)
+                prior, judged = stale_prior(run, whole.reported, seed=number)
                 tables[v].add("joint with a stale prior", score_joint(judged, joint(run, prior)))
                 tables[v].add("stale prior alone", score_prior(judged, prior))
             if number < n_dbscan:
@@ -127,7 +127,7 @@ def priors(fleets: Path, case: Case, n_replicates: int, vehicles: tuple[int, ...
             run = whole.first_vehicles(v)
             alone = joint(run)
             for name, how in PRIOR_CASES.items():
-                prior, judged = stale_prior(run, how, seed=number)
+                prior, judged = stale_prior(run, whole.reported, how, seed=number)
                 fused = joint(run, prior)
                 tables[name].add("with", score_joint(judged, fused))
                 tables[name].add("without", score_joint(run, alone))

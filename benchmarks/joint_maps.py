@@ -123,9 +123,11 @@ def own_sign(run: Run, fused: JointMap) -> Ints:
     return own
 
 
-def stale_prior(run: Run, how: Staleness = STALE, *, seed: int) -> tuple[PriorMap, Run]:
-    """Return an outdated map of the signs in view, and the run scored against what was reported or the prior holds."""
-    rows = np.flatnonzero(run.reference["n_passes_in_view"].to_numpy() > 0)  # of the largest fleet
+def stale_prior(run: Run, rows: Ints, how: Staleness = STALE, *, seed: int) -> tuple[PriorMap, Run]:
+    """Return an outdated map of some signs, and the run scored against what was reported or the prior holds.
+
+    `rows` of the reference: those that the largest fleet reported; no fleet can judge what nobody could report.
+    """
     scene, code = run.reference.take(pa.array(rows)), run.reference_code[rows]
     lon, lat = lonlat(scene)
     copy = make_stale(sign_keys(scene["sign_id"].to_pylist()), lon, lat, code, how, seed=SEED + seed)

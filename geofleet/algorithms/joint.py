@@ -13,7 +13,7 @@ the translation of the whole map: small as a rule, and sometimes not. docs/fusio
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -125,9 +125,12 @@ def fuse_joint(
     views_of = np.zeros((len(tracks.pass_code), 2)) if view_xy is None else view_xy
     n_fleet = len(passes.gnss_sigma_m)
     scaled_tracks, factor = scaled(tracks, n_fleet)
+    passes = _widened(passes, factor)
     bias, bias_cov = pass_biases(scaled_tracks, passes)
     xy_m, cov = places(scaled_tracks, bias, bias_cov)
-    joined, joined_of = without_fragments(scaled_tracks, xy_m, cov)
+    # a gate that took the noise for smaller parts a track by its errors: its pieces lie apart by more than chance
+    leeway = np.maximum(factor, 1.0)[tracks.pass_code]
+    joined, joined_of = without_fragments(scaled_tracks, xy_m, cov * leeway[:, None, None])
     if prior is not None:
         joined, passes = with_prior(joined, passes, prior)
         views_of = np.concatenate((views_of, prior.view_xy))
@@ -136,6 +139,15 @@ def fuse_joint(
     search.run()
     solution = search.final()
     return _described(search, solution, factor, joined_of, views=views, view_xy=views_of, n_given=len(tracks.pass_code))
+
+
+def _widened(passes: Passes, factor: Floats) -> Passes:
+    """Return the passes with the sigmas of offset and bias as much larger as the noise of their frames is.
+
+    A car whose frames are worse than it declares is hardly right about the rest; one that is better may still be.
+    """
+    scale = np.sqrt(np.maximum(factor, 1.0))
+    return replace(passes, gnss_sigma_m=passes.gnss_sigma_m * scale, bias_sigma=passes.bias_sigma * scale[:, None])
 
 
 def _described(

@@ -28,6 +28,10 @@ OTHER_CLASS = 0.01
 """A partner of another class counts this much: a misread class still holds the pass in place."""
 PARTNER_CHI2 = 18.0
 """A partner further away than this lends no weight."""
+FEW_OFFSETS = 256
+"""So many candidate offsets are all weighed; of more, those that most rows vote for."""
+VOTED_OFFSETS = 32
+VOTE_CELL_M = 0.5
 N_ROUNDS = 3
 MOVED_M = 0.25
 NO_POINT = -1
@@ -229,25 +233,64 @@ def _best(  # noqa: PLR0917
 ) -> tuple[float, float]:
     """Return the likeliest offset, among those that bring a row onto a point of its class and the present one."""
     best, found_e, found_n = -np.inf, offset[0], offset[1]
-    for r in range(-1, rows.size):
-        begin, end = (0, 1) if r < 0 else (near_start[r], near_start[r + 1])
-        for at in range(begin, end):
-            if r < 0:
-                east, north = offset[0], offset[1]
-            else:
-                k, i = near[at], rows[r]
-                if of_class[k] != class_code[i]:
-                    continue
-                east, north = xy_m[i, 0] - total[k, 0] / count[k], xy_m[i, 1] - total[k, 1] / count[k]
-            for _ in range(2):  # as it stands, and where its partners pull it
-                value, pulled_e, pulled_n = _gain(
-                    east, north, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start
-                )
-                value -= (east * east + north * north) / (2 * sigma2)
-                if value > best:
-                    best, found_e, found_n = value, east, north
-                east, north = pulled_e, pulled_n
+    candidates = _candidates(xy_m, class_code, rows, total, count, of_class, near, near_start, offset)
+    for at in range(len(candidates)):
+        east, north = candidates[at]
+        for _ in range(2):  # as it stands, and where its partners pull it
+            value, pulled_e, pulled_n = _gain(
+                east, north, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start
+            )
+            value -= (east * east + north * north) / (2 * sigma2)
+            if value > best:
+                best, found_e, found_n = value, east, north
+            east, north = pulled_e, pulled_n
     return found_e, found_n
+
+
+@njit(cache=True, nogil=True)
+def _candidates(  # noqa: PLR0917
+    xy_m: Floats,
+    class_code: Ints,
+    rows: Ints,
+    total: Floats,
+    count: Ints,
+    of_class: Ints,
+    near: Ints,
+    near_start: Ints,
+    offset: Floats,
+) -> Floats:
+    """Return the present offset, and those that bring a row onto a point of its class, (n, 2).
+
+    Of many, one each of the cells of offsets that most rows vote for: a long pass costs no more than its rows.
+    """
+    found = np.empty((near.size + 1, 2))
+    found[0] = offset
+    n = 1
+    for r in range(rows.size):
+        for at in range(near_start[r], near_start[r + 1]):
+            k, i = near[at], rows[r]
+            if of_class[k] == class_code[i]:
+                found[n, 0] = xy_m[i, 0] - total[k, 0] / count[k]
+                found[n, 1] = xy_m[i, 1] - total[k, 1] / count[k]
+                n += 1
+    found = found[:n]
+    if n <= FEW_OFFSETS:
+        return found
+    low_e, low_n = found[:, 0].min() - 2 * VOTE_CELL_M, found[:, 1].min() - 2 * VOTE_CELL_M
+    column = ((found[:, 0] - low_e) / VOTE_CELL_M).astype(np.int64)
+    row = ((found[:, 1] - low_n) / VOTE_CELL_M).astype(np.int64)
+    votes = np.zeros((row.max() + 3, column.max() + 3), np.int64)
+    for at in range(1, n):  # a cell and those around it, so that no border parts those who agree
+        votes[row[at] - 1 : row[at] + 2, column[at] - 1 : column[at] + 2] += 1
+    kept = [0]
+    for at in np.argsort(np.array([-votes[row[at], column[at]] for at in range(n)]), kind="mergesort"):
+        if votes[row[at], column[at]] > 0 and at > 0:
+            kept.append(at)
+            votes[row[at], column[at]] = 0  # its other offsets are as good as this one
+        if len(kept) > VOTED_OFFSETS:
+            break
+    chosen: Floats = found[np.array(kept)]
+    return chosen
 
 
 @njit(cache=True, nogil=True)

@@ -235,13 +235,13 @@ def without_fragments(tracks: Tracks, xy_m: Floats, cov: Floats) -> tuple[Tracks
 
 def _fragments(tracks: Tracks, xy_m: Floats, cov: Floats) -> Ints:
     frames = np.where(tracks.dof > 0, (tracks.dof + UNKNOWNS) / 2, np.inf)
-    density = np.minimum(frames / (tracks.frame_last - tracks.frame_first + 1), 1.0)
+    frames = np.minimum(frames, tracks.frame_last - tracks.frame_first + 1)
     group: Ints = _join(
         tracks.pass_code,
         tracks.class_code,
         tracks.frame_first,
         tracks.frame_last,
-        density,
+        frames,
         np.ascontiguousarray(xy_m),
         cov,
     )
@@ -250,7 +250,7 @@ def _fragments(tracks: Tracks, xy_m: Floats, cov: Floats) -> Ints:
 
 @njit(cache=True, nogil=True)
 def _join(  # noqa: PLR0917
-    pass_code: Ints, class_code: Ints, first: Ints, last: Ints, density: Floats, xy_m: Floats, cov: Floats
+    pass_code: Ints, class_code: Ints, first: Ints, last: Ints, frames: Floats, xy_m: Floats, cov: Floats
 ) -> Ints:
     """Return the group of each track, named by its first row; rows of a pass stand together."""
     n = len(pass_code)
@@ -266,17 +266,18 @@ def _join(  # noqa: PLR0917
                 en = cov[i, 0, 1] + cov[j, 0, 1]
                 chi2 = (nn * east * east - 2 * en * east * north + ee * north * north) / (ee * nn - en * en)
                 is_near = east * east + north * north < FRAGMENT_REACH_M**2 and chi2 < FRAGMENT_CHI2
-                if is_near and _is_apart(group, first, last, density, i, j):
+                if is_near and _is_apart(group, first, last, frames, i, j):
                     group[j] = i
             j += 1
     return group
 
 
 @njit(cache=True, nogil=True)
-def _is_apart(group: Ints, first: Ints, last: Ints, density: Floats, lead: int, other: int) -> bool:  # noqa: PLR0917
+def _is_apart(group: Ints, first: Ints, last: Ints, frames: Floats, lead: int, other: int) -> bool:  # noqa: PLR0917
     """Return whether a track likely shares no frame with any member of the group of `lead`."""
     for k in range(lead, other):
         is_during = first[k] <= last[other] and first[other] <= last[k]
-        if group[k] == lead and is_during and density[k] + density[other] > 1.0:
+        span = max(last[k], last[other]) - min(first[k], first[other]) + 1
+        if group[k] == lead and is_during and frames[k] + frames[other] > span:
             return False
     return True
