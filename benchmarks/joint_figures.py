@@ -40,7 +40,7 @@ def draw_fleet_sizes(bars: dict[str, Any], path: Path) -> None:
         axes = figure.subplots(len(names), 2, squeeze=False)
         for (left, right), name in zip(axes, names, strict=True):
             for method, (colour, mark, dash, label) in LINES.items():
-                sizes = [int(v) for v in bars[name] if method in bars[name][v]]
+                sizes = sorted(int(v) for v in bars[name] if method in bars[name][v])
                 style = {"color": colour, "marker": mark, "linestyle": dash, "markersize": 4, "label": label}
                 of = [bars[name][str(v)][method] for v in sizes]
                 left.plot(sizes, [min(row["gospa_m_median"], MOST_M) for row in of], **style)
@@ -71,7 +71,7 @@ def draw_reliability(honesty: dict[str, Any], path: Path) -> None:
                     marker=mark,
                     color=colour,
                     label=f"{v} passes",
-                    linewidth=1,
+                    linestyle="none",
                 )
                 for b in bins:
                     axes.annotate(

@@ -25,6 +25,9 @@ against the signs that at least one pass of the fleet reported: what nobody repo
 prior map, signs that it holds count too. Gate 2 m, equal class. *Known association* is the same solver told which
 track is of which sign; it pays for nothing else, so what separates it from the truth is noise and the GNSS offset that
 a fleet has in common. *DBSCAN corrected* is DBSCAN after `--correct-bias`, on the same detections and passes.
+
+The figures are of few replicates, whose number stands beside them: 20 or 5 do not settle a 1st percentile or a bar, and
+hard cases were measured as the method grew. `benchmarks/joint.py bars --replicates 200` makes them anew.
 """
 
 HONESTY = """Relative places: the common translation of the map is taken out. The bound is Bayesian, with known
