@@ -339,4 +339,4 @@ def test_an_extract_against_an_inventory(shared_data, tmp_path):
     assert (whole["tp"], common["tp"]) == (4, 4)
     assert whole["rmse_m"] == 0.0
     assert whole["fn"] - common["fn"] == clipped.counts["reference_signs_clipped"] > 100
-    assert common["fn"] == 8
+    assert (common["fp"], common["fn"]) == (1, 1)  # three signs of the extract are painted on the road: markings
