@@ -14,8 +14,7 @@ from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.config import load_config
 from geofleet.engines.local import run_tasks
 from geofleet.errors import ConfigError, InputError, TableError
-from geofleet.steps import aggregate as step
-from geofleet.steps.aggregate import aggregate
+from geofleet.steps.aggregate import aggregate, tiles
 from geofleet.tables.schemas import DETECTIONS, SIGNS
 from geofleet.tables.store import build_table, lonlat, read_table, write_table
 
@@ -79,7 +78,7 @@ def test_tiles_workers_batches_and_row_order_do_not_show(tmp_path, monkeypatch, 
     assert whole.n_signs > 30
     expected = whole.out.read_bytes()
     for zoom in zooms:
-        monkeypatch.setattr(step, "BATCH_ROWS", 5 * zoom)
+        monkeypatch.setattr(tiles, "BATCH_ROWS", 5 * zoom)
         result = run_on(tmp_path, mixed, tile_zoom=zoom, n_workers=2, semantic=semantic)
         assert result.out.read_bytes() == expected, zoom
     assert result.n_tiles > 60

@@ -11,8 +11,7 @@ from geofleet.algorithms import partitions
 from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.config import load_config
 from geofleet.errors import ConfigError, InputError, TableError
-from geofleet.steps import aggregate as step
-from geofleet.steps.aggregate import aggregate
+from geofleet.steps.aggregate import aggregate, tiles
 from geofleet.tables import staging
 from geofleet.tables.schemas import DETECTIONS, PASSES, REFERENCE, SIGNS
 from geofleet.tables.store import build_table, lonlat, read_table, write_table
@@ -100,7 +99,7 @@ def test_every_method_finds_four_signs_and_tiles_and_rows_do_not_show(tmp_path, 
     assert layer.num_rows == 4
     assert distances_m(layer).max() < 1.0
     assert set(layer["method"].to_pylist()) == {f"{method}-{semantic}"}
-    monkeypatch.setattr(step, "BATCH_ROWS", 7)
+    monkeypatch.setattr(tiles, "BATCH_ROWS", 7)
     mixed = table.take(np.random.default_rng(1).permutation(table.num_rows))
     again = run_on(tmp_path, mixed, name="again", method=method, semantic=semantic, tile_zoom=20)
     assert again.out.read_bytes() == whole.out.read_bytes()
@@ -205,7 +204,7 @@ def test_repeated_keys_are_found_however_far_apart_the_ids_are(tmp_path, monkeyp
 def test_hot_tiles_are_split(tmp_path, monkeypatch):
     whole = run_on(tmp_path, detections(), tile_zoom=12)
     assert whole.n_tiles == 1
-    monkeypatch.setattr(step, "BATCH_ROWS", 40)
+    monkeypatch.setattr(tiles, "BATCH_ROWS", 40)
     split = run_on(tmp_path, detections(), name="split", tile_zoom=12)
     assert split.n_tiles > 1
     assert split.out.read_bytes() == whole.out.read_bytes()

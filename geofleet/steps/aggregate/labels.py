@@ -1,0 +1,42 @@
+"""How a layer calls its method, and which options go together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from geofleet.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from geofleet.config import AggregateConfig
+
+
+def method_label(settings: AggregateConfig, k_from: Path | None, prior: Path | None) -> str:
+    """Return how the layer calls its method; where K came from and whether biases are taken out are part of it."""
+    if prior and settings.method != "joint":
+        raise ConfigError(f"{settings.method} takes no prior map.", where="--prior", todo="Use --method joint.")
+    if settings.method == "joint":
+        if settings.correct_bias or settings.k or k_from:
+            raise ConfigError(
+                "joint fusion solves the bias of each pass itself and takes no K.",
+                where="--correct-bias, --k, --k-from",
+                todo="Leave them out.",
+            )
+        return "joint-prior" if prior else "joint"
+    label = f"{settings.method}-{settings.semantic}{'-corrected' * settings.correct_bias}"
+    if settings.method not in {"kmeans", "kmedoids"}:
+        if k_from or settings.k:
+            raise ConfigError(
+                f"{settings.method} takes no K.", where="--k", todo="Leave it out, or use kmeans or kmedoids."
+            )
+        return label
+    if settings.k and k_from:
+        raise ConfigError("K is given twice.", where="--k and --k-from", todo="Give one of them.")
+    if settings.k and settings.semantic == "first":
+        raise ConfigError(
+            f"k={settings.k} is for all classes together, and semantic=first clusters each class by itself.",
+            where="--k",
+            todo="Use --k-from REFERENCE for the number of signs a class, or leave K out to have it chosen.",
+        )
+    return f"{label}-oracle-k" if k_from else f"{label}-k{settings.k}" if settings.k else label

@@ -1,0 +1,116 @@
+"""What became of the detections, and what is written beside a layer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from geofleet.errors import InputError
+from geofleet.tables.manifest import write_manifest
+from geofleet.tables.schemas import EVIDENCE
+from geofleet.tables.store import atomic_path, read_table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pyarrow as pa
+
+    from geofleet.config import Config
+    from geofleet.tables.manifest import Hashing
+
+
+@dataclass(frozen=True, slots=True)
+class AggregateResult:
+    """What became of the detections.
+
+    `n_detections` and `n_rejected` count the whole table, `n_used` the vehicles asked for; signs are clusters with
+    enough passes.
+    """
+
+    out: Path
+    rejected: Path | None
+    run_ids: tuple[str, ...]
+    n_vehicles: int
+    n_detections: int
+    n_rejected: int
+    n_used: int
+    n_tiles: int
+    n_clusters: int
+    n_signs: int
+    notes: tuple[str, ...] = ()
+
+    def summary(self) -> list[str]:
+        """Return the result in sentences."""
+        lines = [
+            (
+                f"{self.n_signs} signs from {self.n_used} of {self.n_detections} detections of {self.n_vehicles} "
+                f"vehicles in {len(self.run_ids)} run(s): {self.n_clusters} clusters in {self.n_tiles or 'no'} tiles, "
+                f"{self.n_clusters - self.n_signs} with too little support."
+            ),
+            *self.notes,
+        ]
+        if self.rejected:
+            lines.append(f"{self.n_rejected} detections could not be used: {self.rejected}")
+        return [*lines, f"Written: {self.out}"]
+
+
+def beside(out: Path, name: str) -> Path:
+    """Return where the side table of a layer is."""
+    return out.with_name(f"{out.stem}_{name}.parquet")
+
+
+def explain(out: Path, sign_id: str) -> pa.Table:
+    """Return the evidence of a sign of a jointly fused layer: detections, passes, residuals and classes read.
+
+    Raises
+    ------
+    InputError
+        The layer has no evidence beside it, or no such sign.
+    """
+    evidence = read_table(EVIDENCE, beside(out, "evidence"))
+    rows = evidence.filter(pc.equal(evidence["sign_id"], sign_id))
+    if rows.num_rows == 0:
+        raise InputError(
+            f"no detection belongs to a sign {sign_id!r}.",
+            where=str(beside(out, "evidence")),
+            todo="Take a sign_id of the layer; one that only the prior map knows has no detections.",
+        )
+    return rows
+
+
+def write_rejected(rejected: pa.Table, out: Path) -> Path | None:
+    """Write the rejected rows beside the output; without any, remove what an earlier run left there."""
+    path = out.with_name(f"{out.stem}_rejected.parquet")
+    if rejected.num_rows == 0:
+        path.unlink(missing_ok=True)
+        return None
+    with atomic_path(path) as draft:
+        pq.write_table(rejected, draft, compression="zstd")
+    return path
+
+
+def few(fleet: dict[str, int], n_vehicles: int | None) -> tuple[str, ...]:
+    """Return where fewer vehicles report than were asked for."""
+    if not fleet:
+        return ("There are no detections: the layer is empty.",)
+    return tuple(
+        f"Run {run_id}: {reporting} of the {n_vehicles} vehicles asked for have detections."
+        for run_id, reporting in fleet.items()
+        if n_vehicles and reporting < n_vehicles
+    )
+
+
+def write_result_manifest(result: AggregateResult, inputs: Hashing, config: Config) -> None:
+    """Write the manifest of a layer, last of all."""
+    names = ("n_vehicles", "n_detections", "n_rejected", "n_used", "n_clusters", "n_signs")
+    write_manifest(
+        result.out,
+        step="aggregate",
+        inputs=inputs,
+        config_digest=config.digest("aggregate"),
+        settings=config.aggregate.model_dump(),
+        counts={name: getattr(result, name) for name in names},
+    )
