@@ -26,6 +26,7 @@ MAX_ACCELERATION_MPS2 = 10.0  # full braking on a dry road
 JUMP_M = 5.0  # steps off by less than this are noise
 TEAR_S = 30.0  # a chain may hold an impossible step where leaving it out would cost more than this much recording
 HOLD_S = 5.0
+BACKING_SATELLITES = 8
 STANDING_RADIUS_M = 0.3
 STANDING_S = 2.0
 _MAX_STANDING_RADIUS_M = 3.0
@@ -106,6 +107,16 @@ def hasty_fixes(t_s: Floats, is_fixed: Flags, segment: Ints) -> Flags:
     adjoined = ~is_fixed[before] | ~is_fixed[after]
     hasty = is_fixed[first] & adjoined & (t_s[stop - 1] - t_s[first] < HOLD_S)
     return np.asarray(np.repeat(hasty, stop - first))
+
+
+def unbacked_fixes(is_hasty: Flags, n_satellites: Floats) -> Flags:
+    """Tell which of the fixes that do not hold are backed by fewer than `BACKING_SATELLITES` satellites.
+
+    Four satellites give a position that nothing checks, and each one more checks little of it. In Nagoya's drive 85 of
+    89 such fixes are more than 1 m off, the one of 41.8 m among them, at an agreeing float position; of the other 356
+    that do not hold 28 are. A fix that holds may have few satellites. NaN satellites are taken for enough.
+    """
+    return np.asarray(is_hasty & (n_satellites < BACKING_SATELLITES))
 
 
 def noise_m(t_s: Floats, xyz_m: Floats) -> float:

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 
 from geofleet.errors import ConfigError
 from geofleet.formats.drive_times import guess_format, times_of
-from geofleet.formats.inventory_columns import numbers, parse_times, read_options
+from geofleet.formats.inventory_columns import numbers, read_options
 from geofleet.tables.schemas import TIME
 
 if TYPE_CHECKING:
@@ -167,8 +167,4 @@ def time_column(table: pa.Table, name: str | None) -> tuple[pa.Array, int]:
         return pa.nulls(table.num_rows, TIME), int(known.sum())
     t_utc, _ = times_of(text, form)
     lost = known.to_numpy(bool) & np.isnat(t_utc)
-    if lost.any():  # few: they are looked at one by one
-        read, _ = parse_times(pa.chunked_array([pa.array(text[lost], pa.string())]))
-        t_utc[lost] = np.array([None if t is None else t.replace(tzinfo=None) for t in read], "datetime64[us]")
-        lost = known.to_numpy(bool) & np.isnat(t_utc)
     return pa.array(t_utc, pa.timestamp("us")).cast(TIME), int(lost.sum())

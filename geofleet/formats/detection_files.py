@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
-import csv
 import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -15,6 +13,7 @@ import shapely
 from geofleet.errors import InputError
 from geofleet.formats.inventory_files import CRS84, detect, read_features
 from geofleet.formats.reading import read_head, refuse_long_lines
+from geofleet.formats.text_tables import encoding_of, read_header
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 BATCH_ROWS = 100_000
 _BLOCK_BYTES = 8 << 20
 _SAMPLE_BYTES = 1 << 20
-_DELIMITERS = ",;\t|"
 _GEOMETRY_NAMES = ("geometry", "geom", "wkb_geometry")
 _AGAIN = "Fetch or export it again."
 
@@ -83,8 +81,8 @@ def _csv_batches(path: Path) -> Iterator[Batch]:
     from pyarrow import csv as arrow_csv  # noqa: PLC0415  (only CSV needs it)
 
     refuse_long_lines(path)
-    encoding = _encoding(path)
-    names, delimiter = _header(path, encoding)
+    encoding = encoding_of(path, max_bytes=_SAMPLE_BYTES)
+    header = read_header(path, encoding)
     if _is_one_line(path):
         return
     broken: list[tuple[int, str]] = []
@@ -96,9 +94,11 @@ def _csv_batches(path: Path) -> Iterator[Batch]:
     # Text, all of it: as numbers 274.10 and 0205 would lose what tells them apart
     reader = arrow_csv.open_csv(
         path,
-        read_options=arrow_csv.ReadOptions(encoding=encoding, block_size=_BLOCK_BYTES, use_threads=False),
-        parse_options=arrow_csv.ParseOptions(delimiter=delimiter, invalid_row_handler=keep),
-        convert_options=arrow_csv.ConvertOptions(column_types=dict.fromkeys(names, pa.string())),
+        read_options=arrow_csv.ReadOptions(
+            encoding=encoding, block_size=_BLOCK_BYTES, use_threads=False, skip_rows=header.n_before
+        ),
+        parse_options=arrow_csv.ParseOptions(delimiter=header.delimiter, invalid_row_handler=keep),
+        convert_options=arrow_csv.ConvertOptions(column_types=dict.fromkeys(header.names, pa.string())),
     )
     first = 1
     for block in reader:
@@ -152,34 +152,7 @@ def _feature_batches(path: Path) -> Iterator[Batch]:
         yield Batch(features.table.slice(first, BATCH_ROWS), shapes, features.crs, first + 1)
 
 
-def _encoding(path: Path) -> str:
-    """Return UTF-16 by its mark, UTF-8 when the first mebibyte is, else Windows-1252."""
-    with path.open("rb") as file:
-        sample = file.read(_SAMPLE_BYTES)
-    if sample.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return "utf-16"
-    try:
-        codecs.getincrementaldecoder("utf-8")().decode(sample)
-    except UnicodeDecodeError:
-        return "cp1252"
-    return "utf-8"
-
-
 def _is_one_line(path: Path) -> bool:
     """Tell whether a file holds a header and no row, which Arrow takes for a fault."""
     with path.open("rb") as file:
         return not file.readline() or not file.read(_SAMPLE_BYTES).strip()
-
-
-def _header(path: Path, encoding: str) -> tuple[list[str], str]:
-    """Return the column names and what stands between them."""
-    with path.open(encoding="utf-8-sig" if encoding == "utf-8" else encoding) as file:
-        line = file.readline(_SAMPLE_BYTES)
-    delimiter = max(_DELIMITERS, key=line.count)
-    names = next(csv.reader([line], delimiter=delimiter), [])
-    if len(names) < 2:  # noqa: PLR2004  (a class needs a position)
-        raise InputError("the first line names no columns.", where=str(path), todo="Give a CSV file with a header.")
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError(f"columns {', '.join(twice)[:200]} are there twice.", where=str(path), todo="Rename them.")
-    return names, delimiter

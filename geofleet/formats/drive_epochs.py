@@ -34,6 +34,8 @@ class Epochs:
         Name of the fix quality.
     sigma_e_m, sigma_n_m
         Standard deviations as declared.
+    n_satellites
+        Satellites used.
     elapsed_s
         Seconds since some moment, for a file that does not say which; else None.
     part
@@ -49,6 +51,7 @@ class Epochs:
     quality: NDArray[np.object_]
     sigma_e_m: Floats
     sigma_n_m: Floats
+    n_satellites: Floats
     elapsed_s: Floats | None = None
     part: Ints | None = None
     has_clock: bool = True
@@ -57,7 +60,7 @@ class Epochs:
     def of(cls, lon: Floats, lat: Floats, **given: Any) -> Epochs:
         """Return epochs of which nothing is known but the position and what is given."""
         n = len(lon)
-        unknown = {name: np.full(n, np.nan) for name in ("height_m", "sigma_e_m", "sigma_n_m")}
+        unknown = {name: np.full(n, np.nan) for name in ("height_m", "sigma_e_m", "sigma_n_m", "n_satellites")}
         empty = {"t_utc": np.full(n, "NaT", "datetime64[us]"), "quality": np.full(n, None, object)}
         return cls(lon=lon, lat=lat, **(unknown | empty | given))
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _MAX_UTM_LAT_DEG, _MAX_LON_DEG = 84.0, 180.0
-_LEAST_RADIUS_M = 6_300_000.0  # the poles lie 6 357 km from the centre
+LEAST_RADIUS_M = 6_300_000.0  # the poles lie 6 357 km from the centre
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ def to_places(x: Floats, y: Floats, z: Floats, local: LocalCrs, *, where: str) -
     if not np.isfinite(z).any():
         raise ConfigError(f"{known.name} needs a third coordinate.", where=where, todo="Name it: height=….")
     radius = np.sqrt(x**2 + y**2 + z**2)
-    on_earth = np.isfinite(radius) & (radius > _LEAST_RADIUS_M)
+    on_earth = np.isfinite(radius) & (radius > LEAST_RADIUS_M)
     x, y, z = (np.where(on_earth, side, np.nan) for side in (x, y, z))
     lon, lat, height = Transformer.from_crs(known, "EPSG:4979", always_xy=True).transform(x, y, z)
     lon, lat, height = (np.where(np.isfinite(side), side, np.nan) for side in (lon, lat, height))

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pyproj import Geod
 
-from geofleet.algorithms.drive_quality import find_jumps, find_stops, find_tears, hasty_fixes, standing_radius_m
+from geofleet.algorithms.drive_quality import (
+    BACKING_SATELLITES,
+    find_jumps,
+    find_stops,
+    find_tears,
+    hasty_fixes,
+    standing_radius_m,
+    unbacked_fixes,
+)
 from geofleet.algorithms.geodesy import to_ecef
 
 if TYPE_CHECKING:
@@ -25,6 +33,7 @@ GAP_S = 0.5
 GAP_STEPS, GAP_M = 10.0, 20.0  # of places without a clock
 STANDING_M = 0.3
 FIXED, FLOAT = "fixed", "float"
+WRONG_FIXES = f"wrong fixes: they do not hold, and fewer than {BACKING_SATELLITES} satellites back them"
 _GEOD = Geod(ellps="WGS84")
 
 
@@ -67,44 +76,57 @@ def judge_epochs(epochs: Epochs) -> Judged:
 
     Epochs are sorted by time; of equal times the first is kept; jumps are left out; of a stop the first and the last
     epoch are kept. A gap in time, an impossible step, and a stretch that the file sets apart start a segment. Fixes
-    that do not hold are called float. Epochs without any time are left as they are.
+    that do not hold are called float, and left out where too few satellites back them. Epochs without any time are left
+    as they are.
     """
     if np.isnan(epochs.seconds()).all():
         part = np.zeros(len(epochs.lon), np.int64) if epochs.part is None else _numbered(epochs.part)
         motion = replace(_motion(np.arange(len(part)), epochs, part, STANDING_M), speed_mps=np.full(len(part), np.nan))
         return Judged(epochs, motion, {}, {"epochs without a time": len(part), "segments": int(part[-1]) + 1})
+    epochs, skipped, found = _in_order(epochs)
+    epochs, left_out, told = _credible(epochs)
+    t_s, xyz_m = epochs.seconds(), to_ecef(epochs.lon, epochs.lat)
+    segment, n_gaps, n_tears = _segments(t_s, xyz_m, epochs.part, has_clock=epochs.has_clock)
+    stops = find_stops(t_s, xyz_m, segment)
+    standing, inside = stops.is_standing(len(t_s)), stops.is_inside(len(t_s))
+    motion = _motion(t_s, epochs, segment, standing_radius_m(t_s, xyz_m), standing)
+    skipped |= left_out | {"epochs inside of a stop": int(inside.sum())}
+    found |= {
+        "gaps": n_gaps,
+        "impossible steps that start a segment": n_tears,
+        "stops": len(stops.first),
+        "epochs standing still": int(standing.sum()),
+    }
+    return Judged(epochs.take(~inside), motion.take(~inside), skipped, found | told)
+
+
+def _in_order(epochs: Epochs) -> tuple[Epochs, dict[str, int], dict[str, int]]:
+    """Return the epochs that have a time, ascending, one of each time; what was left out, and what was found."""
     no_time = np.isnan(epochs.seconds())
     epochs = epochs.take(~no_time)
     order = np.argsort(epochs.seconds(), kind="stable")
     epochs = epochs.take(order)
     again = np.concatenate(([False], np.diff(epochs.seconds()) <= 0))
-    epochs = epochs.take(~again)
-    jump = np.zeros(len(epochs.lon), bool)
-    if epochs.has_clock:
-        jump = find_jumps(epochs.seconds(), to_ecef(epochs.lon, epochs.lat))
-    epochs = epochs.take(~jump)
+    skipped = {"epochs without a time": int(no_time.sum()), "duplicate epochs": int(again.sum())}
+    return epochs.take(~again), skipped, {"epochs out of order": int((np.diff(order) < 0).sum())}
+
+
+def _credible(epochs: Epochs) -> tuple[Epochs, dict[str, int], dict[str, int]]:
+    """Return the epochs that one car can have driven, their fixes judged; what was left out, and what was found."""
     t_s, xyz_m = epochs.seconds(), to_ecef(epochs.lon, epochs.lat)
-    segment, n_gaps, n_tears = _segments(t_s, xyz_m, epochs.part, has_clock=epochs.has_clock)
-    hasty = hasty_fixes(t_s, epochs.quality == FIXED, segment)
+    jump = find_jumps(t_s, xyz_m) if epochs.has_clock else np.zeros(len(t_s), bool)
+    epochs, t_s, xyz_m = epochs.take(~jump), t_s[~jump], xyz_m[~jump]
+    segment, _, _ = _segments(t_s, xyz_m, epochs.part, has_clock=epochs.has_clock)
+    is_fixed = epochs.quality == FIXED
+    hasty = hasty_fixes(t_s, is_fixed, segment)
+    wrong = unbacked_fixes(hasty, epochs.n_satellites)
     epochs = replace(epochs, quality=np.where(hasty, FLOAT, epochs.quality))
-    stops = find_stops(t_s, xyz_m, segment)
-    standing, inside = stops.is_standing(len(t_s)), stops.is_inside(len(t_s))
-    motion = _motion(t_s, epochs, segment, standing_radius_m(t_s, xyz_m), standing)
-    skipped = {
-        "epochs without a time": int(no_time.sum()),
-        "duplicate epochs": int(again.sum()),
-        "impossible jumps": int(jump.sum()),
-        "epochs inside of a stop": int(inside.sum()),
-    }
-    found = {
-        "epochs out of order": int((np.diff(order) < 0).sum()),
-        "gaps": n_gaps,
-        "impossible steps that start a segment": n_tears,
-        "stops": len(stops.first),
-        "epochs standing still": int(standing.sum()),
-        "fixes that do not hold, called float": int(hasty.sum()),
-    }
-    return Judged(epochs.take(~inside), motion.take(~inside), skipped, found)
+    skipped = {"impossible jumps": int(jump.sum()), WRONG_FIXES: int(wrong.sum())}
+    found = {"fixes that do not hold, called float": int((hasty & ~wrong).sum())}
+    if is_fixed.any():
+        held_s = np.concatenate((t_s[:1], t_s[is_fixed & ~hasty], t_s[-1:]))
+        found["seconds without a fix that holds, at the longest"] = int(np.diff(held_s).max())
+    return epochs.take(~wrong), skipped, found
 
 
 def motion_of(t_s: Floats, lon: Floats, lat: Floats) -> Motion:

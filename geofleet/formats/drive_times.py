@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 from pyproj import Geod
 
 from geofleet.formats.gnss_time import GPS_EPOCH, gpst_to_utc, microseconds
+from geofleet.formats.inventory_columns import parse_numbers, parse_times
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,27 +26,44 @@ _SLOWEST_MPS = 0.1  # a speed of zero between two places would take for ever
 _LEAST_COUNT = {"unix_ns": 1e17, "unix_us": 1e14, "unix_ms": 1e11, "unix_s": 1e8}
 
 
+_ZONE = r"(?:Z|[+-]\d{2}(?::?\d{2})?|UTC|GMT)\s*$"
+
+
+def numbers_of(text: pd.Series[str]) -> Floats:
+    """Return texts as finite numbers, NaN where one is none; a comma may be the decimal point."""
+    values = pd.to_numeric(text.str.strip(), errors="coerce").to_numpy(np.float64, na_value=np.nan)
+    if np.isnan(values).any() and text.str.contains(",", na=False).any():
+        values = parse_numbers(pa.array(text, pa.string(), from_pandas=True))
+    return np.where(np.isfinite(values), values, np.nan)
+
+
 def guess_format(text: pd.Series[str]) -> str:
     """Return the format of a column of times by the size of its numbers; text that is no number is a date."""
-    number = pd.to_numeric(text, errors="coerce")
-    if number.isna().sum() * 2 > len(number):
+    number = numbers_of(text)
+    if not len(number) or np.isnan(number).sum() * 2 > len(number):
         return "iso"
-    middle = float(number.abs().median())
+    middle = float(np.nanmedian(np.abs(number)))
     return next((name for name, least in _LEAST_COUNT.items() if middle >= least), "relative_s")
 
 
-def times_of(text: pd.Series[str], time_format: str) -> tuple[Times, Floats | None]:
-    """Return UTC of a column of times, NaT where it is none; or seconds, where it does not say since when."""
+def times_of(text: pd.Series[str], time_format: str, *, day_first: bool | None = None) -> tuple[Times, Floats | None]:
+    """Return UTC of a column of times, NaT where it is none; or seconds, where it does not say since when.
+
+    Dates are in ISO 8601, or have day, month and year in another order where it is clear; without a zone they are UTC.
+    """
     if time_format == "iso":
-        parsed = pd.to_datetime(text.str.strip(), format="ISO8601", utc=True, errors="coerce")
-        return parsed.dt.tz_localize(None).to_numpy("datetime64[us]"), None
-    number = pd.to_numeric(text.str.strip(), errors="coerce").to_numpy(np.float64)
-    number = np.where(np.isfinite(number), number, np.nan)
+        return _dates(text.str.strip(), day_first=day_first), None
+    number = numbers_of(text)
     if time_format in _GPS:
         return gpst_to_utc(GPS_EPOCH + microseconds(number * _GPS[time_format])), None
     if time_format in _UNIX:
         return np.asarray(_UNIX_EPOCH + microseconds(number * _UNIX[time_format])), None
     return np.full(len(number), "NaT", "datetime64[us]"), number
+
+
+def n_without_zone(text: pd.Series[str]) -> int:
+    """Return how many dates of a column do not say in which time zone they are."""
+    return int((text.notna() & ~text.str.contains(_ZONE, na=True, regex=True)).sum())
 
 
 def times_of_velocity(lon: Floats, lat: Floats, speed_mps: Floats) -> Floats:
@@ -61,3 +80,15 @@ def times_of_velocity(lon: Floats, lat: Floats, speed_mps: Floats) -> Floats:
     _, _, step_m = Geod(ellps="WGS84").inv(lon[known][:-1], lat[known][:-1], lon[known][1:], lat[known][1:])
     elapsed[known] = np.concatenate(([0.0], np.cumsum(np.asarray(step_m) / ((speed[:-1] + speed[1:]) / 2.0))))
     return elapsed
+
+
+def _dates(text: pd.Series[str], *, day_first: bool | None) -> Times:
+    """Return dates as UTC; those that are not ISO 8601 are looked at one by one."""
+    parsed = pd.to_datetime(text, format="ISO8601", utc=True, errors="coerce")
+    t_utc = parsed.dt.tz_localize(None).to_numpy("datetime64[us]").copy()
+    lost = np.isnat(t_utc) & text.notna().to_numpy(bool)
+    if lost.any():
+        rest = pa.chunked_array([pa.array(text[lost], pa.string(), from_pandas=True)])
+        read, _ = parse_times(rest, day_first=day_first)
+        t_utc[lost] = np.array([None if t is None else t.replace(tzinfo=None) for t in read], "datetime64[us]")
+    return t_utc

@@ -14,11 +14,12 @@ import numpy as np
 import pyarrow as pa
 
 from geofleet.errors import ConfigError, InputError
-from geofleet.formats import drive_csv, gpx, nmea, rtklib
+from geofleet.formats import drive_csv, drive_layout, gpx, inventory_files, nmea, rtklib
 from geofleet.formats.datum import datum_of
 from geofleet.formats.drive_quality import judge_epochs
-from geofleet.formats.positions import reject_null_island
-from geofleet.formats.reading import Datum, LayerRead, read_head
+from geofleet.formats.positions import PlaceCheck, area_doubt, reject_null_island
+from geofleet.formats.reading import BZIP2, GZIP, Datum, LayerRead, read_head
+from geofleet.formats.text_tables import is_header
 from geofleet.tables.schemas import DRIVES, TIME
 from geofleet.tables.store import build_table, lonlat
 
@@ -51,6 +52,24 @@ def detect(head: bytes) -> str:
     return next((name for name, is_it in DETECTORS.items() if is_it(head)), "")
 
 
+def recognise(path: Path) -> str:
+    """Return the name of the format of what is known to be a drive, or "" when it is none of ours.
+
+    Columns of text are one, whatever they are called: their reader says what is missing.
+
+    Raises
+    ------
+    InputError
+        The file is missing, unreadable, empty, or packed in a way that is not read.
+    """
+    head = read_head(path)
+    if found := detect(head):
+        return found
+    if head.startswith((GZIP, BZIP2)):
+        raise InputError("a packed file, of which only GPX is read (.gpx.gz).", where=str(path), todo="Unpack it.")
+    return CSV if inventory_files.detect(head) == CSV and is_header(drive_layout.columns_of(head)) else ""
+
+
 def read_drive(
     path: Path,
     file_format: str = "auto",
@@ -79,12 +98,14 @@ def read_drive(
         An option is unknown or meant for CSV only.
     """
     head = read_head(path)
-    found_format = detect(head) if file_format == "auto" else file_format
+    found_format = recognise(path) if file_format == "auto" else file_format
     given = {"columns": columns, "crs": crs, "origin": origin, "utm": utm}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if file_format == "auto" and options and not found_format:
         found_format = CSV
-    if found_format not in FORMATS or not (file_format == "auto" or DETECTORS[found_format](head) or options):
+    if found_format not in FORMATS or not (
+        file_format == "auto" or DETECTORS[found_format](head) or options or found_format == CSV
+    ):
         raise InputError(
             f"not {FORMATS.get(file_format, 'a trajectory in a format that is read here')}.",
             where=str(path),
@@ -100,7 +121,11 @@ def read_drive(
         epochs, skipped, *notes = readers[found_format](path)
         drives, found = {"": epochs}, notes[0] if notes else {}
     layer = _layer(path, found_format, drives, Counter(skipped), Counter(found))
-    return replace(layer, datum=datum_of(crs, *lonlat(layer.table)) if crs else _AS_RECEIVED)
+    place = lonlat(layer.table)
+    check = PlaceCheck(str(path))
+    check.add(*place, None)
+    layer.found.update(check.doubts() | (area_doubt(crs, *place) if crs else {}))
+    return replace(layer, datum=datum_of(crs, *place) if crs else _AS_RECEIVED)
 
 
 def _layer(

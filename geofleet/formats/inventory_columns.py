@@ -289,10 +289,10 @@ def _written(match: re.Match[str], *, day_first: bool | None) -> datetime | None
         month, day = (two, one) if one > _MONTHS else (one, two)
     elif one == two:
         year, month, day = three, one, two
-    elif day_first is None:
+    elif day_first is None and "." not in match.string[: match.end(3)]:  # with points the day comes first anywhere
         return None
     else:
-        year, month, day = (three, two, one) if day_first else (three, one, two)
+        year, month, day = (three, one, two) if day_first is False else (three, two, one)
     if year < 100:  # noqa: PLR2004  (of this century)
         year += 2000
     clock = f"T{match[4].strip()}" if match[4] else ""

@@ -6,7 +6,6 @@ The format is told from the content, and GDAL is asked for that one driver: no f
 from __future__ import annotations
 
 import codecs
-import csv
 import json
 import re
 import warnings
@@ -20,9 +19,9 @@ import shapely
 
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats.reading import read_head
+from geofleet.formats.text_tables import ANSI, NOT_UTF8, encoding_of, read_header
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -40,8 +39,6 @@ _SUFFIXES = {"gpkg": ".gpkg", "flatgeobuf": ".fgb", "shapefile": ".shp"}  # wher
 _OPEN_OPTIONS = {"geojson": {"DATE_AS_STRING": "YES"}, "geojsonseq": {"DATE_AS_STRING": "YES"}}
 _MAX_UNPACKED_BYTES = 4 << 30
 _CSV_BLOCK_BYTES = 16 << 20
-_DELIMITERS = ";\t|,"
-_SEPARATOR = re.compile(r'"?sep=.')
 _AGAIN = "Fetch or export it again."
 
 
@@ -288,8 +285,11 @@ def _with_wkb(features: Features) -> Features:
 def _read_csv(path: Path, encoding: str | None, delimiter: str | None) -> Features:
     from pyarrow import csv as arrow_csv  # noqa: PLC0415  (only CSV needs it)
 
-    encoding, notes = (encoding, {}) if encoding else _encoding(path)
-    names, delimiter, n_before = _header(path, encoding, delimiter)
+    notes = {}
+    if not encoding:
+        encoding = encoding_of(path)
+        notes = {NOT_UTF8: 1} if encoding == ANSI else {}
+    header = read_header(path, encoding, delimiter)
     bad: list[int] = []
 
     def count(row: Any) -> str:
@@ -300,58 +300,13 @@ def _read_csv(path: Path, encoding: str | None, delimiter: str | None) -> Featur
     table = arrow_csv.read_csv(
         path,
         read_options=arrow_csv.ReadOptions(
-            encoding=encoding, block_size=_CSV_BLOCK_BYTES, use_threads=False, skip_rows=n_before
+            encoding=encoding, block_size=_CSV_BLOCK_BYTES, use_threads=False, skip_rows=header.n_before
         ),
-        parse_options=arrow_csv.ParseOptions(delimiter=delimiter, newlines_in_values=True, invalid_row_handler=count),
+        parse_options=arrow_csv.ParseOptions(
+            delimiter=header.delimiter, newlines_in_values=True, invalid_row_handler=count
+        ),
         # Text, all of it: as numbers 274.10 and 0205 would lose what tells them apart
-        convert_options=arrow_csv.ConvertOptions(column_types=dict.fromkeys(names, pa.string())),
+        convert_options=arrow_csv.ConvertOptions(column_types=dict.fromkeys(header.names, pa.string())),
     )
     skipped = {"rows with another number of columns than the header": len(bad)} if bad else {}
     return Features(table, None, None, "csv", skipped, notes)
-
-
-def _encoding(path: Path) -> tuple[str, dict[str, int]]:
-    """Return the encoding of a text: by its byte order mark, else UTF-8 when all of it is, else Windows-1252."""
-    if read_head(path).startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return "utf-16", {}
-    decoder = codecs.getincrementaldecoder("utf-8")()
-    try:
-        for chunk in _chunks(path):
-            decoder.decode(chunk)
-        decoder.decode(b"", final=True)
-    except UnicodeDecodeError:
-        return "cp1252", {"read as Windows-1252, since it is not UTF-8": 1}
-    return "utf-8", {}
-
-
-def _chunks(path: Path) -> Iterator[bytes]:
-    with path.open("rb") as file:
-        while chunk := file.read(1 << 20):
-            yield chunk
-
-
-def _header(path: Path, encoding: str, delimiter: str | None) -> tuple[list[str], str, int]:
-    """Return the column names, what stands between them, and how many lines come before.
-
-    Those are comments (`#`), and the line by which a spreadsheet names the separator (`sep=;`).
-    """
-    n_before = 0
-    try:
-        with path.open(encoding="utf-8-sig" if encoding.lower() in {"utf-8", "utf8"} else encoding) as file:
-            line = file.readline(1 << 16)
-            while line.startswith("#") or (_SEPARATOR.match(line) and not n_before):
-                n_before += 1
-                line = file.readline(1 << 16)
-    except LookupError:
-        raise ConfigError(f"unknown encoding {encoding!r}.", todo="Give one such as utf-8 or cp1252.") from None
-    unquoted = re.sub(r'"[^"]*"', "", line)
-    delimiter = delimiter or max(_DELIMITERS, key=unquoted.count)
-    names = next(csv.reader([line], delimiter=delimiter), [])
-    if len(names) < 2:  # noqa: PLR2004  (a code needs a position)
-        raise InputError(
-            "the first line names no columns.", where=str(path), todo="Give a CSV file with a header, or the delimiter."
-        )
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError(f"columns {', '.join(twice)[:200]} are there twice.", where=str(path), todo="Rename them.")
-    return names, delimiter, n_before

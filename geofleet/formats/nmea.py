@@ -1,4 +1,4 @@
-"""NMEA 0183 logs: position from GGA (else RMC), date from RMC or ZDA, standard deviations from GST.
+"""NMEA 0183 logs: position from GGA (else GNS, else RMC), date from RMC or ZDA, standard deviations from GST.
 
 Sentences are found wherever they stand in a line, so logs of Android (`NMEA,$GPGGA,…*63,1699400577561`) and logs mixed
 with binary messages are read. Sentences without a checksum are taken, those with a wrong one are left out; both are
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from geofleet.errors import InputError
+from geofleet.errors import SUSPICIOUS, InputError
 from geofleet.formats.drive_epochs import NO_POSITION, Epochs
 from geofleet.formats.gnss_time import microseconds
 from geofleet.formats.reading import refuse_long_lines
@@ -27,19 +27,24 @@ if TYPE_CHECKING:
     Times = NDArray[np.datetime64]
 
 GGA_QUALITY = {1: "single", 2: "dgps", 3: "single", 4: "fixed", 5: "float", 9: "sbas"}
+_GNS_NUMBERS = {"R": "4", "F": "5", "D": "2", "P": "1", "A": "1"}  # quality of GGA
 RMC_QUALITY = {"A": "single", "D": "dgps", "R": "fixed", "F": "float", "P": "ppp"}
 _SENTENCE = re.compile(rb"\$([A-Z]{2})([A-Z]{3}),([^$*\r\n\x80-\xff]{0,400})(\*[^\r\n,]{0,2})?")
-_DETECT = re.compile(rb"\$(?:G[A-Z]|BD|QZ)(?:GGA|RMC|GST|GSA|GSV|GLL|VTG|TXT|GNS|ZDA|DTM),")
+_DETECT = re.compile(rb"\$[A-Z]{2}(?:GGA|RMC|GST|GSA|GSV|GLL|VTG|TXT|GNS|ZDA|DTM),")
+_UBX = b"\xb5\x62"  # begins a binary message of a u-blox receiver
 _HALF_DAY_S = 43_200.0
 _DAY_S = 86_400.0
-_KNOWN = ("GGA", "RMC", "GST", "ZDA")
+_KNOWN = ("GGA", "GNS", "RMC", "GST", "ZDA")
 _N_FIELDS = 15
+# GPS counts weeks in ten bits: a receiver that does not know of the rollovers says a date 19.6 years too early
+_LONG_AGO = np.datetime64("2007-04-07")
+_OLD = f"{SUSPICIOUS}dated before 2007-04; does the receiver count its weeks 1024 too low?"
 _CENTURY_PIVOT = 80  # GPS began in 1980
 
 
 def detect(head: bytes) -> bool:
     """Tell whether a file's first bytes hold a sentence of a satellite receiver."""
-    return bool(_DETECT.search(head))
+    return head.startswith(_UBX) or bool(_DETECT.search(head))
 
 
 def read_epochs(path: Path) -> tuple[Epochs, dict[str, int], dict[str, int]]:
@@ -61,7 +66,8 @@ def read_epochs(path: Path) -> tuple[Epochs, dict[str, int], dict[str, int]]:
     frame, n_bad_times = _timed(frame)
     epoch = _numbered(frame["second"].to_numpy(np.float64))
     n = int(epoch[-1]) + 1 if len(epoch) else 0
-    gga, rmc, gst = (_fields(frame, kind, epoch, n) for kind in ("GGA", "RMC", "GST"))
+    rmc, gst = (_fields(frame, kind, epoch, n) for kind in ("RMC", "GST"))
+    gga = _fields(frame, "GGA", epoch, n).combine_first(_as_gga(_fields(frame, "GNS", epoch, n)))
     second = pd.Series(frame["second"].to_numpy(np.float64)).groupby(epoch).first().to_numpy(np.float64)
     t_utc, elapsed_s = _times(second, _dates(frame, epoch, n))
     from_rmc = gga[6].isna().to_numpy() & rmc[2].eq("A").to_numpy()
@@ -75,24 +81,45 @@ def read_epochs(path: Path) -> tuple[Epochs, dict[str, int], dict[str, int]]:
         t_utc=t_utc,
         height_m=_numbers(gga[9]) + _numbers(gga[11]),
         quality=np.where(from_rmc, rmc[12].map(RMC_QUALITY), gga[6].map(lambda q: GGA_QUALITY.get(_integer(q)))),
+        n_satellites=_numbers(gga[7]),
         sigma_n_m=_positive(_numbers(gst[6])),
         sigma_e_m=_positive(_numbers(gst[7])),
         elapsed_s=elapsed_s,
     )
     placed = epochs.is_placed()
     if not placed.any():
-        raise InputError(
-            f"holds no epoch with a position ({counts['sentences']} sentences read, "
-            f"{counts['wrong']} of them with a wrong checksum).",
-            where=str(path),
-            todo="Give a log with GGA or RMC sentences of a receiver that has a fix.",
-        )
+        raise _no_position(path, content, counts, n)
     skipped = {"sentences with a wrong checksum": counts["wrong"], "sentences without a readable time": n_bad_times}
     skipped[NO_POSITION] = int((~placed).sum())
     found = {"sentences without a checksum": counts["missing"], "sentences of other kinds": counts["other"]}
+    found[_OLD] = int((t_utc[placed] < _LONG_AGO).sum())
     if elapsed_s is not None:
         found["no date in the log: times are not known"] = n
     return epochs.take(placed), skipped, {name: count for name, count in found.items() if count}
+
+
+def _no_position(path: Path, content: bytes, counts: dict[str, int], n_epochs: int) -> InputError:
+    """Return why a log holds no position."""
+    if not counts["sentences"]:
+        what = "a log of binary messages (UBX), which are not read" if content.startswith(_UBX) else "no sentence"
+        return InputError(f"holds {what}.", where=str(path), todo="Log or convert it to NMEA: GGA or RMC.")
+    kinds = sorted({match[2].decode() for match in _SENTENCE.finditer(content)})
+    return InputError(
+        f"holds no epoch with a position ({counts['sentences']} sentences read, {', '.join(kinds)[:100]}, "
+        f"{counts['wrong']} of them with a wrong checksum; {n_epochs} epochs, none with a fix).",
+        where=str(path),
+        todo="Give a log with GGA, GNS or RMC sentences of a receiver that has a fix.",
+    )
+
+
+def _as_gga(gns: pd.DataFrame) -> pd.DataFrame:
+    """Return GNS sentences as GGA ones: a quality for each system becomes that of the best one."""
+    best = gns[6].map(
+        lambda modes: next((_GNS_NUMBERS[m] for m in "RFDPA" if isinstance(modes, str) and m in modes), None)
+    )
+    return pd.DataFrame(
+        {1: gns[1], 2: gns[2], 3: gns[3], 4: gns[4], 5: gns[5], 6: best, 7: gns[7], 9: gns[9], 11: gns[10]}
+    )
 
 
 def checksums(content: bytes, first: NDArray[np.int64], stop: NDArray[np.int64]) -> NDArray[np.uint8]:

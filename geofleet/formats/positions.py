@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 _MAX_LON_DEG, _MAX_LAT_DEG = 180.0, 90.0
 _NULL_ISLAND_DEG, _EMPTY_SEA_DEG = 0.001, 1.5  # no land within 1.5 degrees of 0 N 0 E but for one buoy
 _ALONE_M = 100_000.0
+_SWAPPED = (
+    "The axes look swapped: name x and y the other way round (--columns x=…,y=…), or say swap_xy = true in a TOML file "
+    "of columns."
+)
 _ROW_BITS, _ROW_OFFSET = 12, 1024
 _CELL_DEG = 0.1  # places are looked up by cell: the outlines have a margin of three of them
 _AREA_MARGIN_DEG, _ANTARCTIC_DEG = 0.5, -60.0
@@ -217,7 +221,7 @@ def _refuse_contradiction(x: Floats, y: Floats, degrees: Flags, crs: Any, where:
         raise InputError(
             f"the coordinates are no longitudes and latitudes ({span}).",
             where=where,
-            todo="The axes look swapped (swap_xy)." if swapped else "Give the CRS, e.g. --crs EPSG:31370.",
+            todo=_SWAPPED if swapped else "Give the CRS, e.g. --crs EPSG:31370.",
         )
 
 

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 
 from geofleet.errors import SUSPICIOUS, ConfigError, InputError
 from geofleet.formats import layers
-from geofleet.formats.reading import LayerStream, read_head
+from geofleet.formats.reading import LayerStream
 from geofleet.tables.manifest import write_manifest
 from geofleet.tables.schemas import BBOX, DRIVES, LANES, SIGNS
 from geofleet.tables.store import lonlat, sort_by_key, write_pieces
@@ -185,7 +185,7 @@ def recognise(path: Path) -> str:
     """
     from geofleet.formats import drives  # noqa: PLC0415  (as above)
 
-    return drives.detect(read_head(path))
+    return drives.recognise(path)
 
 
 def _plan(

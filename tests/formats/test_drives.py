@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-from pyproj import Geod
+from pyproj import Geod, Transformer
 
 from geofleet.algorithms.geodesy import to_ecef
 from geofleet.errors import InputError
@@ -37,7 +37,7 @@ def first_time(path):
     ("name", "n", "quality", "gaps"),
     [
         ("nagoya/reference_1Hz.pos", 1231, {"fixed"}, 0),
-        ("nagoya/rover_rtk.pos", 5395, {"fixed", "float"}, 15),
+        ("nagoya/rover_rtk.pos", 5395, {"fixed", "float"}, 22),
         ("nagoya/rover_1Hz_spp.pos", 550, {"single"}, 26),
         ("nagoya/static_rover_rtk.pos", 301, {"fixed"}, 0),
         ("colorado/demo5_b34f_f.pos", 4521, {"fixed", "float"}, 0),
@@ -94,10 +94,47 @@ def test_a_baseline_solution_is_refused_with_the_reason(shared_data):
         read_drive(shared_data / "trajectory" / "misc" / "demo1_out.pos")
 
 
-def test_an_earth_centred_solution_is_refused(tmp_path):
-    text = "%  GPST   x-ecef(m)  y-ecef(m)  z-ecef(m)   Q  ns\n" + rows(["2023/07/11 06:04:30.000"])
-    with pytest.raises(InputError, match="Earth-centred"):
-        read_drive(pos(tmp_path, text))
+@pytest.mark.parametrize("title", ["%  GPST   x-ecef(m)  y-ecef(m)  z-ecef(m)   Q  ns\n", ""])
+def test_an_earth_centred_solution_is_turned_into_degrees_and_its_sigmas_too(tmp_path, title):
+    lon, lat = 10.0, 50.0
+    rotation = np.array(list(topocentric_axes(lon, lat)))
+    enu_m2 = np.array([[4.0, 0.6, -0.5], [0.6, 9.0, 1.0], [-0.5, 1.0, 25.0]]) * 1e-4
+    ecef_m2 = rotation.T @ enu_m2 @ rotation
+    x, y, z = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True).transform(lon, lat, 300.0)
+    signed = np.sign(ecef_m2) * np.sqrt(np.abs(ecef_m2))
+    sigmas = " ".join(f"{signed[i, j]:.9f}" for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0)))
+    text = f"{title}2023/07/11 06:04:30.000 {x:.4f} {y:.4f} {z:.4f} 1 12 {sigmas} 0.0 5.0\n"
+    row = read_drive(pos(tmp_path, text)).table.to_pylist()[0]
+    assert (row["sigma_e_m"], row["sigma_n_m"], row["height_m"]) == pytest.approx((0.02, 0.03, 300.0), abs=1e-3)
+    assert (row["fix_quality"], row["t_utc"].second) == ("fixed", 12)
+    assert np.ravel(lonlat(read_drive(pos(tmp_path, text)).table)) == pytest.approx([10, 50], abs=1e-8)
+
+
+def topocentric_axes(lon, lat):
+    """Return the rows east, north, up in Earth-centred axes, by differences of pyproj."""
+    to_ecef_3d = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    at = np.array(to_ecef_3d.transform(lon, lat, 0.0))
+    for step in ((1e-6, 0, 0), (0, 1e-6, 0), (0, 0, 1.0)):
+        axis = np.array(to_ecef_3d.transform(lon + step[0], lat + step[1], step[2])) - at
+        yield axis / np.linalg.norm(axis)
+
+
+def test_a_baseline_without_a_header_is_refused_by_its_speed(tmp_path):
+    lines = [f"2023/07/11 06:04:{s:02d}.000 {30 + 1.2 * s:.4f} {50 + s:.4f} 2.0 {TAIL}\n" for s in range(20)]
+    with pytest.raises(InputError, match="kilometres a second: a baseline solution"):
+        read_drive(pos(tmp_path, "".join(lines)))
+
+
+def test_heights_above_sea_level_are_told_and_not_taken(tmp_path):
+    head = "% program : RTKLIB\n% (lat/lon/height=WGS84/geodetic,Q=1:fix)\n"
+    layer = read_drive(pos(tmp_path, head + TITLE.format("GPST") + rows(["2023/07/11 06:04:30.000"])))
+    assert layer.table["height_m"].null_count == 1
+    assert layer.found["heights above sea level, not taken"] == 1
+
+
+def test_a_byte_order_mark_is_no_line(tmp_path):
+    layer = read_drive(pos(tmp_path, "\ufeff" + TITLE.format("GPST") + rows(["2023/07/11 06:04:30.000"])))
+    assert (layer.table.num_rows, layer.skipped) == (1, {})
 
 
 @pytest.mark.parametrize(
@@ -182,7 +219,8 @@ def test_motion_of_one_epoch_is_unknown(tmp_path):
     [
         (b"", "the file is empty"),
         (b"hello\n", "not a trajectory in a format"),
-        (b"lat,lon\n50,10\n", "not a trajectory in a format"),
+        (b"a,b\n50,10\n", "no columns that look like a position; there are a, b"),
+        (b"\x1f\x8b\x08\0", "packed file"),
         (b"% program   : RTKLIB\n", "holds no epoch"),
         (b"% program   : RTKLIB\n1 2 3\n", "holds no epoch"),
     ],

@@ -142,3 +142,64 @@ def test_what_makes_no_sense_is_refused(tmp_path, text, message):
 
 def test_an_inventory_is_no_drive():
     assert detect(b"id,lat,lon,code\n1,50,10,206\n") == ""
+
+
+LINES = [
+    ("2024-05-01T12:00:00Z", 48.0, 11.0),
+    ("2024-05-01T12:00:01Z", 48.0001, 11.0),
+    ("2024-05-01T12:00:02Z", 48.0002, 11.0),
+]
+
+
+def rows(pattern):
+    return "".join(pattern.format(t=t, day=t[:10], clock=t[11:19], lat=lat, lon=lon) for t, lat, lon in LINES)
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        ("time;lat;lon;height\n" + rows("{t};{lat};{lon};500.25\n").replace(".", ","), "utf-8"),
+        ("Zeit;Breite;Länge\n" + rows("01.05.2024 {clock};{lat};{lon}\n").replace("48.", "48,"), "cp1252"),
+        ("sep=;\ntime;lat;lon\n" + rows("{t};{lat};{lon}\n"), "utf-8-sig"),
+        ("# a drive\n\ntime,lat,lon\n" + rows("{t},{lat},{lon}\n"), "utf-8"),
+        ("time\tlat\tlon\n" + rows("{t}\t{lat}\t{lon}\n"), "utf-16"),
+        ('"time","lat","lon"\n' + rows('"{t}","{lat}","{lon}"\n'), "utf-8"),
+        ("date,time,lat,lon\n" + rows("{day},{clock},{lat},{lon}\n"), "utf-8"),
+        ("date|lat|lon\n" + rows("{t}|{lat}|{lon}\n"), "utf-8"),
+        ("timestamp;lat;lon\n" + "1714564800,0;48;11\n1714564801,0;48,0001;11\n1714564802,0;48,0002;11\n", "utf-8"),
+    ],
+)
+def test_tables_of_spreadsheets_are_read_alike(tmp_path, text, encoding):
+    path = tmp_path / "drive.csv"
+    path.write_text(text, encoding=encoding, newline="")
+    table = read_drive(path).table
+    assert table["t_utc"].to_pylist() == [datetime(2024, 5, 1, 12, 0, s, tzinfo=UTC) for s in range(3)]
+    np.testing.assert_allclose(lonlat(table), ([11, 11, 11], [48, 48.0001, 48.0002]))
+
+
+def test_a_date_that_could_be_two_is_told_and_settled_by_an_option(tmp_path):
+    path = csv_file(tmp_path, "time,lat,lon\n05/01/2024 12:00:00,48,11\n05/01/2024 12:00:01,48.0001,11\n")
+    layer = read_drive(path)
+    assert any("day or the month first" in told for told in layer.found)
+    assert layer.table["t_utc"].null_count == 2
+    toml = csv_file(tmp_path, "day_first = false\n", "m.toml")
+    assert read_drive(path, columns=toml).table["t_utc"][0].as_py() == datetime(2024, 5, 1, 12, tzinfo=UTC)
+
+
+def test_times_without_a_zone_are_taken_as_utc_and_told(tmp_path):
+    layer = read_drive(csv_file(tmp_path, "time,lat,lon\n2024-05-01 12:00:00,48,11\n2024-05-01 14:00:01+02:00,48,11\n"))
+    assert layer.found["times without a zone, taken as UTC"] == 1
+    assert layer.table["t_utc"][1].as_py() == datetime(2024, 5, 1, 12, 0, 1, tzinfo=UTC)
+
+
+def test_metres_called_x_and_y_are_a_position_once_a_crs_is_known(tmp_path):
+    path = csv_file(tmp_path, "t,x,y\n2024-05-01T12:00:00Z,691000,5331000\n")
+    with pytest.raises(InputError, match="no columns that look like a position; there are t, x, y"):
+        read_drive(path)
+    lon, lat = lonlat(read_drive(path, crs="EPSG:25832").table)
+    assert (lon[0], lat[0]) == pytest.approx((11.5657, 48.1036), abs=1e-3)
+
+
+def test_a_drive_in_the_middle_of_the_sea_is_told(tmp_path):
+    layer = read_drive(csv_file(tmp_path, "time,lat,lon\n2024-05-01T12:00:00Z,-40,-120\n"))
+    assert any("from any land" in told for told in layer.found)

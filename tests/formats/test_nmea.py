@@ -7,7 +7,7 @@ from functools import reduce
 import numpy as np
 import pytest
 
-from geofleet.errors import InputError
+from geofleet.errors import SUSPICIOUS, InputError
 from geofleet.formats.drives import detect, read_drive
 from geofleet.formats.nmea import checksums, read_epochs
 from geofleet.tables.store import lonlat
@@ -103,6 +103,39 @@ def test_without_a_date_the_seconds_still_count(tmp_path):
     assert layer.table["t_utc"].null_count == 10
     assert layer.table["speed_mps"].to_numpy() == pytest.approx(18.53, rel=0.01)
     assert layer.found["no date in the log: times are not known"] == 10
+
+
+def gns(clock, modes="RRNN"):
+    return sentence(f"GNGNS,{clock},4846.0000000,N,01125.0000000,E,{modes},11,0.8,455.0,45.0,1.0,0000,V")
+
+
+def test_gns_alone_is_as_good_as_gga(tmp_path):
+    path = log(tmp_path, gns("060430.00"), sentence("GNZDA,060430.00,11,07,2023,00,00"), gns("060431.00", "NRAN"))
+    table = read_drive(path).table
+    assert table["fix_quality"].to_pylist() == ["fixed", "fixed"]
+    assert table["height_m"].to_pylist() == [500.0, 500.0]
+    assert times(path)[0] == "2023-07-11T06:04:30.000000"
+
+
+def test_a_date_before_the_rollover_is_suspicious(tmp_path):
+    layer = read_drive(log(tmp_path, rmc("060430.00", date="251103")))
+    assert any(told.startswith(SUSPICIOUS) and "1024" in told for told in layer.found)
+
+
+def test_binary_messages_before_and_between_sentences_are_passed_over(tmp_path):
+    path = tmp_path / "mixed.ubx"
+    ubx = b"\xb5\x62\x01\x07\x5c\x00" + bytes(range(92)) + b"\xff\x0a"
+    path.write_bytes(60 * ubx + gga("060430.00").encode() + b"\r\n" + ubx + gga("060431.00").encode() + b"\r\n")
+    assert read_drive(path).table.num_rows == 2
+    path.write_bytes(ubx)
+    with pytest.raises(InputError, match="binary messages"):
+        read_drive(path)
+
+
+def test_a_log_of_other_sentences_names_them(tmp_path):
+    path = log(tmp_path, sentence("GPGLL,4800.0,N,01100.0,E,060430.00,A,A"))
+    with pytest.raises(InputError, match=r"1 sentences read, GLL, 0 of them"):
+        read_drive(path)
 
 
 def test_epochs_without_a_fix_are_left_out(tmp_path):
