@@ -17,6 +17,7 @@ SCENARIO ?= paper
 VEHICLES ?= 50
 REPLICATES ?= 1
 SEED ?= 0
+FLEETS ?= 10
 CODE := $(shell find geofleet sql -name '*.py' -o -name '*.sql' -o -name '*.toml' -o -name '*.csv' -o -name '*.html' 2>/dev/null)
 
 .PHONY: FORCE help setup demo test check study results environments ingest simulate aggregate evaluate report format bench lock clean
@@ -55,7 +56,8 @@ report: $(P)/report/_manifest.json ## The page, the figures, the QGIS project
 # Stamps of the variables above: a file that changes when, and only when, its values change.
 $(P)/.inputs: VALUES = $(MAP) $(DRIVE)
 $(P)/.fleet: VALUES = $(SCENARIO) $(VEHICLES) $(REPLICATES) $(SEED)
-$(P)/.inputs $(P)/.fleet: FORCE
+$(P)/.study: VALUES = $(SCENARIO) $(FLEETS) $(SEED)
+$(P)/.inputs $(P)/.fleet $(P)/.study: FORCE
 	@mkdir -p $(P); echo "$(VALUES)" | cmp -s - $@ || echo "$(VALUES)" > $@
 
 $(P)/signs/signs_manifest.json: $(P)/.inputs $(MAP) $(CODE) | $(READY)
@@ -82,13 +84,14 @@ $(P)/report/_manifest.json: $(P)/evaluation/_manifest.json $(P)/lanes/lanes_mani
 	$(GEOFLEET) report $(P)
 
 STUDY := $(P)/study
-FLEETS ?= 10
-STUDY_OPTIONS = --out $(STUDY) --scenario $(SCENARIO) --replicates $(FLEETS) --seed $(SEED)
+STUDY_INPUTS := $(P)/signs/signs_manifest.json $(P)/drives/drives_manifest.json
+STUDY_OPTIONS = --signs $(P)/signs/signs.parquet --drive $(P)/drives/drives.parquet --out $(STUDY) \
+  --scenario $(SCENARIO) --replicates $(FLEETS) --seed $(SEED)
 
 study: $(STUDY)/compare/_manifest.json $(STUDY)/fleet-size/_manifest.json $(STUDY)/sweep-semantic_rate/_manifest.json ## The paper's Table 2 and Figures 3 to 5
 	@echo "Figures and tables are in $(STUDY); make results writes docs/results.md from them."
 
-$(STUDY)/compare/_manifest.json: $(CODE) | $(READY)
+$(STUDY)/compare/_manifest.json: $(P)/.study $(STUDY_INPUTS)
 	$(GEOFLEET) study compare $(STUDY_OPTIONS)
 
 $(STUDY)/fleet-size/_manifest.json: $(STUDY)/compare/_manifest.json

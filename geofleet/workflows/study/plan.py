@@ -30,7 +30,7 @@ from geofleet.workflows.study.units import (
     Unit,
     map_fleets,
     run_all,
-    score_map,
+    score_maps,
     simulate_fleets,
     unit_digest,
     world_batch,
@@ -164,7 +164,8 @@ def run_search(search: Search) -> None:
         seen: dict[int, list[dict[str, Any]]] = {}
 
         def meets(size: int) -> bool:
-            seen[size] = score_map(*fleet.map(size))
+            fused, scene, labels, config = fleet.map(size)
+            seen[size] = score_maps([(fused, scene, labels)], config)
             return search.target.is_met(total_of(seen[size])[search.target.score])
 
         needed = passes_needed(meets, unit.n_vehicles)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import shutil
 from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import pyarrow as pa
 import pyarrow.compute as pc
 from threadpoolctl import threadpool_limits
 
@@ -25,17 +25,15 @@ from geofleet.errors import ConfigError
 from geofleet.steps.aggregate import aggregate
 from geofleet.steps.simulate import simulate
 from geofleet.tables.matching import match_layers
-from geofleet.tables.schemas import BBOX, GEOMETRY, REFERENCE, SIGNS
+from geofleet.tables.schemas import BBOX, DETECTIONS, GEOMETRY, REFERENCE, SIGNS
 from geofleet.tables.scoring import score_matches
-from geofleet.tables.store import atomic_path, read_table
+from geofleet.tables.store import atomic_path, read_table, write_table
 from geofleet.workflows.stale import stale
 from geofleet.workflows.study.methods import METHODS, with_settings
 from geofleet.workflows.study.worlds import USUAL_PRIOR, code_digest, hash_input
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-
-    import pyarrow as pa
 
     from geofleet.config import Config
     from geofleet.workflows.study.methods import Method
@@ -151,36 +149,45 @@ def _world(study: Study, world: World, units_dir: Path) -> Batch:
 
 def world_batch(study: Study, world: World) -> Batch:
     """Return the batch of a world before it has units."""
-    return Batch(_sending(world, study.methods), study.seed, max(study.sizes), (), study.in_view, study.prior)
+    if any(method.upload == "information" for method in study.methods):
+        world = replace(world, config=_sending(world.config, is_sent=True))
+    return Batch(world, study.seed, max(study.sizes), (), study.in_view, study.prior)
 
 
-def _sending(world: World, methods: Sequence[Method]) -> World:
-    """Have vehicles send the information form when a method reads it."""
-    if all(method.upload == "mean" for method in methods):
-        return world
-    tracking = world.config.tracking.model_copy(update={"send_information": True})
-    return replace(world, config=world.config.model_copy(update={"tracking": tracking}))
+def _sending(config: Config, *, is_sent: bool) -> Config:
+    """Have vehicles send the information form, or not."""
+    tracking = config.tracking.model_copy(update={"send_information": is_sent})
+    return config.model_copy(update={"tracking": tracking})
 
 
 def _missing(world: Batch, size: int) -> Iterator[Batch]:
-    """Yield batches of so many fleets with the units that are not there yet."""
+    """Yield batches of so many fleets with the units that are not there yet.
+
+    Every other batch goes through its methods backwards: two workers then compile different kernels, not the same.
+    """
     units = [unit for unit in world.units if not unit.path.is_file()]
     numbers = sorted({unit.replicate for unit in units})
     for begin in range(0, len(numbers), size):
         some = set(numbers[begin : begin + size])
-        yield replace(world, units=tuple(unit for unit in units if unit.replicate in some))
+        mine = [unit for unit in units if unit.replicate in some]
+        yield replace(world, units=tuple(mine if begin // size % 2 == 0 else reversed(mine)))
 
 
 def unit_digest(batch: Batch, method: Method, n_vehicles: int, replicate: int) -> str:
-    """Return 32 hex digits over everything that shapes the scores of a unit."""
+    """Return 32 hex digits over everything that shapes the scores of a unit.
+
+    What else the study compares does not: names of places and settings are labels, and a method that reads means alone
+    gives the same map whether or not the vehicles send more.
+    """
     world, config = batch.world, with_settings(batch.world.config, method)
+    if method.upload == "mean":
+        config = _sending(config, is_sent=False)
     prior = hash_input(batch.prior) if batch.prior else str(USUAL_PRIOR)
     parts = (
         code_digest(),
         *(hash_input(path) for path in (world.signs, world.drive)),
         config.digest(),
-        *(str(value) for value in (world.place, world.setting, batch.seed, replicate)),
-        *(str(value) for value in (method.label, n_vehicles, prior if method.has_prior else "")),
+        *map(str, (batch.seed, replicate, method.label, n_vehicles, prior if method.has_prior else "")),
         str(batch.n_vehicles if batch.in_view else ""),
     )
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
@@ -208,12 +215,14 @@ class Fleets:
     run_ids: dict[int, str]
     references: dict[int, pa.Table]
 
+    @property
+    def detections(self) -> Path:
+        """The folder with the detections of all fleets, a file each."""
+        return self.folder / "detections"
+
     def of(self, replicate: int) -> Path:
-        """Return a folder with the detections of one fleet alone."""
-        folder, run = self.folder / f"fleet-{replicate}", f"run_id={self.run_ids[replicate]}"
-        if not folder.is_dir():  # links, but of files: readers of partitioned folders follow no others
-            shutil.copytree(self.folder / "simulation" / "detections" / run, folder / run, copy_function=os.link)
-        return folder
+        """Return the file with the detections of one fleet alone."""
+        return self.detections / f"fleet-{replicate}.parquet"
 
     def scene(self, batch: Batch, replicate: int) -> pa.Table:
         """Return the signs that a fleet's map is scored against."""
@@ -245,21 +254,33 @@ def simulate_fleets(batch: Batch, folder: Path) -> Fleets:
     reference = read_table(REFERENCE, out / "reference.parquet")
     references = {number: reference.filter(pc.field("run_id") == run_id) for number, run_id in run_ids.items()}
     fleets = Fleets(folder, run_ids, references)
+    for number, run_id in run_ids.items():
+        _gather(out / "detections" / f"run_id={run_id}", fleets.of(number))
     if any(METHODS[unit.method].has_prior for unit in batch.units) and not batch.prior:
         for number in numbers:  # each has a prior of its own, which its fleet has nothing to do with
             stale(out / "reference.parquet", fleets.prior(number), USUAL_PRIOR, seed=batch.seed + number)
     return fleets
 
 
+def _gather(run: Path, out: Path) -> None:
+    """Put the detections of a run into one file: every map reads them, and opening a file a vehicle takes longest."""
+    alone = out.with_suffix("")
+    alone.mkdir(parents=True)
+    write_table(DETECTIONS, read_table(DETECTIONS, run.rename(alone / run.name).parent), out)
+    shutil.rmtree(alone)
+
+
 def score_fleets(batch: Batch, fleets: Fleets, method: Method, n_vehicles: int) -> dict[int, Rows]:
     """Map the first vehicles of every fleet and return the scores, over all tiles and one a tile, by replicate."""
     maps = map_fleets(batch, fleets, method, n_vehicles)
-    return {
-        number: score_map(
-            fused, fleets.scene(batch, number), fleets.labels(number, method, n_vehicles), batch.world.config
-        )
-        for number, fused in maps.items()
-    }
+    rows = score_maps(
+        [
+            (fused, fleets.scene(batch, number), fleets.labels(number, method, n_vehicles))
+            for number, fused in maps.items()
+        ],
+        batch.world.config,
+    )
+    return {number: [row for row in rows if row["run_id"] == fleets.run_ids[number]] for number in maps}
 
 
 def map_fleets(batch: Batch, fleets: Fleets, method: Method, n_vehicles: int) -> dict[int, pa.Table]:
@@ -271,7 +292,7 @@ def map_fleets(batch: Batch, fleets: Fleets, method: Method, n_vehicles: int) ->
             )
             for number in fleets.run_ids
         }
-    fused = _map(batch, fleets, fleets.folder / "simulation" / "detections", method, n_vehicles, prior=None)
+    fused = _map(batch, fleets, fleets.detections, method, n_vehicles, prior=None)
     return {number: fused.filter(pc.field("run_id") == run_id) for number, run_id in fleets.run_ids.items()}
 
 
@@ -294,10 +315,16 @@ def _map(
     return read_table(SIGNS, out)
 
 
-def score_map(fused: pa.Table, reference: pa.Table, labels: dict[str, Any], config: Config) -> Rows:
-    """Return the scores of a map, over all tiles and one a tile, as rows of `scores` without geometry."""
+def score_maps(maps: Sequence[tuple[pa.Table, pa.Table, dict[str, Any]]], config: Config) -> Rows:
+    """Return the scores of maps, each with its reference and labels, as rows of `scores` without geometry.
+
+    There is a row a map over all tiles, and one a tile.
+    """
     matching: dict[str, Any] = config.evaluate.model_dump(include={"gate_m", "match_on"})
-    matches = match_layers(fused, reference, labels, **matching, tile_zoom=config.aggregate.tile_zoom)
+    matches = pa.concat_tables(
+        match_layers(fused, reference, labels, **matching, tile_zoom=config.aggregate.tile_zoom)
+        for fused, reference, labels in maps
+    )
     scores = score_matches(matches, **matching).drop_columns([GEOMETRY, BBOX])
     rows: Rows = scores.filter(pc.field("concept") == "all").drop_columns(["concept"]).to_pylist()
     return rows
