@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from geofleet.algorithms.geodesy import to_ecef
 from geofleet.errors import InputError
@@ -80,7 +80,7 @@ def error_ellipses(
         raise InputError(f"the probability is {probability}", where="ellipses", todo="Give one in (0, 1), e.g. 0.95.")
     lon, lat, var_e, var_n, cov = (np.asarray(v, np.float64) for v in (lon_deg, lat_deg, var_e_m2, var_n_m2, cov_en_m2))
     half_sum, half_difference = (var_e + var_n) / 2, np.hypot((var_e - var_n) / 2, cov)
-    scale = float(chi2.ppf(probability, 2))
+    scale = float(chdtri(2, 1 - probability))
     least = half_sum - half_difference
     usable = (scale * least >= _SHORTEST_AXIS_M**2) & np.isfinite(half_sum + half_difference)  # NaN is neither
     index = np.flatnonzero(usable)

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from geofleet.algorithms.uncertainty import check_level
+from geofleet.algorithms.uncertainty import check_level, median_rank
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -95,7 +94,7 @@ def sum_up(needed: Sequence[int | None], *, level: float) -> PassesNeeded:
     check_level(level)
     values = np.sort([math.inf if n is None else float(n) for n in needed])
     n = values.size
-    k = int(stats.binom.ppf((1 - level) / 2, n, 0.5))  # as the interval of a median of scores
+    k = median_rank(n, level)
     low, high = (values[k - 1], values[n - k]) if k >= 1 else (math.nan, math.nan)
     return PassesNeeded(
         typical=_whole(values[n // 2]),  # the upper of two middle fleets: no fleet needs half a pass

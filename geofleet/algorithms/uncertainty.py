@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from geofleet.algorithms.uncertainty_mean import bca_ends, bootstrap_t_ends, mean_of, standard_error, t_ends
 from geofleet.errors import InputError
@@ -213,7 +213,7 @@ def two_sided_p(difference: float, standard_error: float, dof: float) -> float:
     """Return the p-value of a difference under Student's t; 1 where there is neither a difference nor a spread."""
     if standard_error == 0:
         return 1.0 if difference == 0 else 0.0
-    return float(2 * stats.t.sf(abs(difference) / standard_error, dof))
+    return float(2 * special.stdtr(dof, -abs(difference) / standard_error))
 
 
 def direction(score: str) -> Direction:
@@ -273,15 +273,22 @@ def _over_runs(method: Method, score: str, n: int, n_null: int, *, unit: str = "
 def _median_interval(values: Floats, *, level: float, words: _Words, n_null: int) -> Interval:
     """Return the narrowest symmetric pair of order statistics that holds the median with at least `level`."""
     n, estimate = values.size, float(np.median(values))
-    # the ends are the k-th smallest and the k-th largest: both on one side with probability P(Binomial(n, 1/2) < k)
-    k = int(stats.binom.ppf((1 - level) / 2, n, 0.5))
+    k = median_rank(n, level)
     if k < 1:
         note = joined(f"{n} runs are too few: even their whole range falls short of {level:.0%}", words.note)
         return Interval(None, None, level, words.estimand, words.method, note, estimate, n_null)
-    exact = 1 - 2 * float(stats.binom.cdf(k - 1, n, 0.5))
+    exact = 1 - 2 * float(special.bdtr(k - 1, n, 0.5))
     note = joined(f"covers {exact:.1%} exactly, the least of {level:.0%} or more that {n} runs can give", words.note)
     ends = float(values[k - 1]), float(values[n - k])
     return Interval(*ends, level, words.estimand, words.method, note, estimate, n_null)
+
+
+def median_rank(n: int, level: float) -> int:
+    """Return the largest k for which the k-th smallest and the k-th largest of n hold the median with a probability.
+
+    Both lie on one side of it with probability P(Binomial(n, 1/2) < k); 0 when n are too few for any pair.
+    """
+    return int(np.searchsorted(special.bdtr(np.arange(n + 1), n, 0.5), (1 - level) / 2))
 
 
 def _few(n: int) -> str:
@@ -296,7 +303,7 @@ def _shape(values: Floats, method: Method) -> str:
     """Say what the distribution of the scores does to an interval of their mean."""
     if np.ptp(values) == 0:
         return f"all {values.size} scores are equal, which says nothing about their spread"
-    skewness = float(stats.skew(values, bias=False))
+    skewness = _skewness(values)
     if abs(skewness) <= _SKEWED:
         return ""
     name = {"t": "Student's t", "bca": "BCa", "bootstrap_t": "bootstrap-t"}[method]
@@ -304,6 +311,13 @@ def _shape(values: Floats, method: Method) -> str:
         f"the scores are skewed ({skewness:+.1f}): {name} may cover as little as 80 % with ten runs; "
         "the median is safer"
     )
+
+
+def _skewness(values: Floats) -> float:
+    """Return the skewness of the distribution that values come from (G1); of two values, 0."""
+    n, off = values.size, values - values.mean()
+    biased = float(np.mean(off**3) / np.mean(off**2) ** 1.5)
+    return biased * math.sqrt(n * (n - 1)) / (n - 2) if n > 2 else biased  # noqa: PLR2004 (G1 needs three)
 
 
 def joined(*notes: str) -> str:

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,7 +29,7 @@ def standard_error(values: Floats) -> float:
 
 def t_ends(values: Floats, level: float) -> tuple[float, float]:
     """Return Student's ends of the mean."""
-    half = float(stats.t.ppf((1 + level) / 2, values.size - 1)) * standard_error(values)
+    half = float(special.stdtrit(values.size - 1, (1 + level) / 2)) * standard_error(values)
     mean = mean_of(values)
     return mean - half, mean + half
 
@@ -45,11 +45,11 @@ def bca_ends(values: Floats, level: float, *, n_draws: int, seed: int) -> tuple[
     # half of the draws that tie with the mean count as below it, also where rounding parts them
     tie = _TINY * np.ptp(values)
     below = (np.searchsorted(draws, mean - tie, "left") + np.searchsorted(draws, mean + tie, "right")) / 2
-    bias = stats.norm.ppf(np.clip(below, 0.5, n_draws - 0.5) / n_draws)
-    tail = math.sqrt(n / (n - 1)) * stats.t.ppf((1 + level) / 2, n - 1)
+    bias = special.ndtri(np.clip(below, 0.5, n_draws - 0.5) / n_draws)
+    tail = math.sqrt(n / (n - 1)) * special.stdtrit(n - 1, (1 + level) / 2)
     shifted = bias + np.array([-tail, tail])
     # extreme levels of very skewed values must stay on their side
-    low, high = np.quantile(draws, stats.norm.cdf(bias + shifted / np.maximum(1 - acceleration * shifted, _TINY)))
+    low, high = np.quantile(draws, special.ndtr(bias + shifted / np.maximum(1 - acceleration * shifted, _TINY)))
     return float(low), float(high)
 
 

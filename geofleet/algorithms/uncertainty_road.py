@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from geofleet.algorithms import uncertainty_blocks as ub
 from geofleet.algorithms.metrics import null_reason
@@ -76,7 +76,7 @@ class Resampled:
     @property
     def t(self) -> float:
         """Student's quantile of the level."""
-        return float(stats.t.ppf((1 + self.level) / 2, self.dof))
+        return float(special.stdtrit(self.dof, (1 + self.level) / 2))
 
     def error(self, influence: Floats) -> float:
         """Return the standard error of a score from what each block adds to it."""
@@ -177,7 +177,7 @@ def _share_ends(road: Resampled, ratio: ub.Ratio) -> Ends:
     """Return Wilson's ends of a share at the effective number of signs, never more than the signs themselves."""
     blocks = road.blocks
     share, n_signs = ub.estimate(blocks, ratio), float(blocks.total @ ratio.below)
-    z_sq = float(stats.norm.ppf((1 + road.level) / 2)) ** 2
+    z_sq = float(special.ndtri((1 + road.level) / 2)) ** 2
     variance = share * (1 - share)
     if variance > 0:
         error = road.error(ub.influence(blocks, ratio))
@@ -286,6 +286,6 @@ def _neighbours_note(name: str, road: Resampled) -> str:
     residual = blocks.apart @ (np.array(ratio.above) - ub.estimate(blocks, ratio) * np.array(ratio.below))
     spread = float(residual @ residual)
     lagged = float(residual[1:] @ residual[:-1]) / spread if spread else 0.0
-    if lagged <= stats.norm.ppf(0.95) / math.sqrt(len(blocks)):
+    if lagged <= special.ndtri(0.95) / math.sqrt(len(blocks)):
         return ""
     return f"neighbouring blocks still correlate ({lagged:.2f}): the interval is too short, give a larger correlation_m"
