@@ -13,8 +13,9 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner
 
-from geofleet.cli import main
+from geofleet.cli import app, main
 
 RAW = Path(__file__).parent.parent / "data" / "raw"
 PBF, POS = RAW / "helsinki.osm.pbf", RAW / "helsinki_derived.pos"
@@ -69,6 +70,26 @@ def test_help_lists_the_steps(tmp_path):
     assert result.returncode == 0
     for command in ("ingest", "simulate", "aggregate", "evaluate", "report", "demo", "sql", "schema"):
         assert command in result.stdout
+
+
+@pytest.mark.parametrize("command", [[], ["ingest"], ["study"]])
+def test_lists_of_commands_say_whole_sentences(command):
+    listing = CliRunner().invoke(app, [*command, "--help"], env={"COLUMNS": "80"}).output.partition("Commands:\n")[2]
+    assert listing.strip()
+    assert all(line.endswith((".", "?")) and not line.endswith("...") for line in listing.rstrip().splitlines())
+
+
+def test_help_imports_nothing_heavy():
+    """`geofleet --help` answers in under 0.3 s: what is imported decides."""
+    code = """
+import sys
+from geofleet.cli import app
+app(["--help"], standalone_mode=False)
+print(*{name.partition('.')[0] for name in sys.modules})
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
+    heavy = {"numpy", "pyarrow", "duckdb", "rich", "pygments", "markdown_it", "pydantic", "scipy", "numba", "pyproj"}
+    assert not heavy & set(result.stdout.splitlines()[-1].split())
 
 
 @pytest.mark.parametrize("kind", ["signs", "lanes", "drive"])

@@ -18,6 +18,7 @@ app = typer.Typer(
     help="Turn the traffic-sign detections of many cars into an updated sign map, and say how good it is.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,
     add_completion=False,
 )
 app.add_typer(ingest.app, name="ingest")

@@ -30,7 +30,9 @@ from geofleet.cli.options import (
 )
 from geofleet.cli.output import print_result, progress_bar
 
-app = typer.Typer(no_args_is_help=True, help="Load sign maps, roads and drives into GeoParquet tables.")
+app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Load sign maps, roads and drives into GeoParquet tables."
+)
 
 
 @app.command("signs")
@@ -141,7 +143,7 @@ def ingest_detections(
     run_id: Annotated[str | None, typer.Option(help="Of rows that do not name one; fleet by default.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Read the detections of a real fleet into a `detections` table; bad rows go to <out>_rejected.parquet.
+    """Read the detections of a real fleet. Bad rows go to <out>_rejected.parquet.
 
     Example: geofleet ingest detections fleet.csv --columns x=lon,y=lat,code=sign --scheme mapillary --out detections
     """

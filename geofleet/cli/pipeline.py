@@ -20,7 +20,7 @@ from geofleet.cli.output import (
     progress_bar,
 )
 
-app = typer.Typer()
+app = typer.Typer(rich_markup_mode=None)
 
 
 @app.command()
@@ -44,7 +44,7 @@ def simulate(
     workers: Workers = N_CORES,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate a fleet that drives past real signs: reference, passes, detections, truth.
+    """Simulate a fleet past real signs. Writes reference, passes, detections and truth.
 
     Example: geofleet simulate --signs signs.parquet --drive drives.parquet --vehicles 50 --out simulation
     """
@@ -153,7 +153,7 @@ def evaluate(
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Score a sign map against a reference: GOSPA_M, precision, recall, F1.
+    """Score a map by GOSPA_M, precision, recall and F1.
 
     Example: geofleet evaluate --map fused.parquet --reference simulation/reference.parquet --out evaluation
     """
@@ -197,7 +197,7 @@ def report(
     vehicles: Annotated[int | None, typer.Option("--vehicles", help="Draw a map of this fleet size.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a page to explore a run (report.html, works offline), figures for print, and a QGIS project.
+    """Write a page, figures and a QGIS project of a run. The page, report.html, works offline.
 
     Example: geofleet report data/processed
     """
@@ -217,7 +217,7 @@ def demo(
     show: Annotated[bool, typer.Option("--show", help="Only print what a finished demo in --out has found.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run the main job on the shipped data: 50 simulated cars past real signs in Helsinki.
+    """Run the main job on the shipped data. 50 simulated cars pass real signs in Helsinki.
 
     Example: geofleet demo --out geofleet-demo
     """

@@ -34,8 +34,10 @@ if TYPE_CHECKING:
     from geofleet.workflows.study.plan import PlanResult
     from geofleet.workflows.study.worlds import Study
 
-app = typer.Typer()
-study_app = typer.Typer(no_args_is_help=True, help="Many simulated fleets: which method, how many vehicles?")
+app = typer.Typer(rich_markup_mode=None)
+study_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Many simulated fleets: which method, how many vehicles?"
+)
 app.add_typer(study_app, name="study")
 
 SignsOption = Annotated[Path | None, typer.Option("--signs", help="Signs of any source; shipped Helsinki by default.")]
@@ -83,7 +85,7 @@ def study_compare(
     workers: Processes = N_CORES,
     as_json: AsJson = False,
 ) -> None:
-    """Compare methods on the same fleets; by default the paper's Table 2, with its rows beside.
+    """Compare methods on the same fleets. By default the paper's Table 2, with its rows beside.
 
     Example: geofleet study compare --methods dbscan,joint --vehicles 1,2,3,5,10,20,50 --scenario paper-ideal
     """
@@ -126,7 +128,7 @@ def study_fleet_size(
     workers: Processes = N_CORES,
     as_json: AsJson = False,
 ) -> None:
-    """Draw how the map follows the size of the fleet: the paper's Figures 3 to 5, with its points beside.
+    """Draw scores over the size of the fleet. The paper's Figures 3 to 5, with its points beside.
 
     Example: geofleet study fleet-size --methods dbscan,dbscan-corrected,joint --replicates 10
     """
@@ -170,7 +172,7 @@ def study_plan(
     workers: Processes = N_CORES,
     as_json: AsJson = False,
 ) -> None:
-    """Say how many passes a drive, a map, sensors and a method need for a map of a given quality.
+    """Say how many passes a given quality needs. On a drive, past a map's signs, with sensors and a method.
 
     Example: geofleet study plan --target gospa_m=0.5 --signs city.osm.pbf --drive drive.pos --method dbscan-corrected
     """
@@ -305,7 +307,7 @@ def stale(
     layer: LayerOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write an outdated copy of a layer of signs, and beside it what is outdated in it.
+    """Write an outdated copy of a layer of signs. Beside it goes what is outdated in it.
 
     Example: geofleet stale simulation/reference.parquet prior.parquet --removed 0.2 --shift-m 1,0
     """

@@ -24,7 +24,7 @@ from geofleet.cli.options import (
 )
 from geofleet.cli.output import print_json, print_result, print_table
 
-app = typer.Typer()
+app = typer.Typer(rich_markup_mode=None)
 
 
 @app.command()
@@ -33,7 +33,7 @@ def sql(
     data: Annotated[Path, typer.Option("--data", help="Folder with tables.")] = Path("data/processed"),
     as_json: AsJson = False,
 ) -> None:
-    """Query the tables below a folder with DuckDB's spatial SQL; each table is a view of its name.
+    """Query tables with DuckDB's spatial SQL. Each table below a folder is a view of its name.
 
     Example: geofleet sql "SELECT concept, count(*) AS n FROM signs GROUP BY concept ORDER BY n DESC"
     """
@@ -59,7 +59,7 @@ def info(
     layer: LayerOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what is in files: format, CRS and datum operation, extent, counts, what was skipped and why.
+    """Tell what is in files and what is skipped. Format, CRS and datum operation, extent, counts, reasons.
 
     Example: geofleet info city.xodr drive.pos
     """
@@ -91,7 +91,7 @@ def convert(
     roads: Annotated[bool, typer.Option("--roads/--no-roads", help="Infer facing and road from the ways.")] = True,
     as_json: AsJson = False,
 ) -> None:
-    """Write signs or lanes as .parquet, .geojson, .gpkg, .fgb, .osm or .osc, whatever they come from.
+    """Write signs or lanes in another format. By suffix: .parquet, .geojson, .gpkg, .fgb, .osm or .osc.
 
     Example: geofleet convert city.xodr city.geojson
     """
@@ -112,7 +112,7 @@ def schema(
     table: Annotated[str | None, typer.Argument(help="Name of a table; all names when left out.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Print the schema of a table: columns with type, unit and meaning.
+    """Print the columns of a table: type, unit, meaning.
 
     Example: geofleet schema detections
     """

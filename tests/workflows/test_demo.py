@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from matplotlib.image import imread
 
 from geofleet.algorithms.geodesy import EnuFrame
+from geofleet.cli.output import print_scores
 from geofleet.config import load_config
 from geofleet.steps.aggregate import aggregate
 from geofleet.tables.manifest import hash_path
@@ -50,6 +52,17 @@ def test_golden_scores(demo):
     assert total["n_vehicles"] == N_VEHICLES
     assert total["f1"] == pytest.approx(GOLDEN_F1, abs=1e-6)
     assert total["gospa_m"] == pytest.approx(GOLDEN_GOSPA_M, abs=1e-6)
+
+
+def test_the_readme_shows_what_the_demo_prints(demo, repo, capsys):
+    """All but the digits of the run's id, which name its settings and inputs: any new setting changes them."""
+    print_scores(demo_result(demo).totals)
+    shown, printed = (
+        re.sub(r"(?m)^(paper-s0-r0-)[0-9a-f]{8}", r"\1xxxxxxxx", text)
+        for text in ((repo / "README.md").read_text(encoding="utf-8"), capsys.readouterr().out)
+    )
+    assert printed.count("\n") == 2
+    assert printed in shown
 
 
 @pytest.mark.parametrize(("path", "name"), TABLES.items())
