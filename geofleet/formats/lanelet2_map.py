@@ -6,7 +6,6 @@ https://github.com/fzi-forschungszentrum-informatik/Lanelet2/tree/master/lanelet
 
 from __future__ import annotations
 
-import gzip
 import re
 from collections import Counter
 from dataclasses import dataclass
@@ -16,13 +15,13 @@ import numpy as np
 
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats.datum import datum_of
-from geofleet.formats.reading import GZIP, WGS84, read_head
+from geofleet.formats.reading import WGS84, open_unpacked, read_head
 from geofleet.formats.xml import explained, iter_elements
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from io import BufferedReader
     from pathlib import Path
+    from typing import BinaryIO
 
     from numpy.typing import NDArray
 
@@ -133,7 +132,7 @@ def load_map(
     Parameters
     ----------
     path
-        OSM XML, or the same packed with gzip.
+        OSM XML, or the same packed with gzip or bzip2.
     origin
         Latitude and longitude, degrees, that `local_x` and `local_y` count from, as Lanelet2's UtmProjector does:
         easting and northing in the UTM zone of the origin, minus those of the origin.
@@ -225,6 +224,11 @@ class _RawMap:
         lon, lat = self._positions(numbers, projection)
         with np.errstate(invalid="ignore"):
             valid = (np.abs(lon) <= _MAX_LON_DEG) & (np.abs(lat) <= _MAX_LAT_DEG)
+        if len(valid) and not valid.any():
+            raise InputError(
+                f"none of {len(valid)} nodes has a valid position.",
+                todo="Export the map again, with lat and lon in degrees.",
+            )
         if not valid.all():
             self.skipped[BAD_POSITION] += int((~valid).sum())
         place = np.where(valid, np.cumsum(valid) - 1, -1)
@@ -350,14 +354,16 @@ def _float(text: str | None) -> float:
 
 def _has_mark(path: Path) -> bool:
     """Tell whether any tag says so, whatever it belongs to: quick, and enough to leave OpenStreetMap's files alone."""
-    head = read_head(path)
-    with explained(path), gzip.open(path) if head.startswith(GZIP) else path.open("rb") as file:
+    read_head(path)  # says what is wrong with the file as such
+    with explained(path), open_unpacked(path) as file:
         return any(_MARK.search(chunk) for chunk in _overlapping(file))
 
 
-def _overlapping(file: gzip.GzipFile | BufferedReader) -> Iterator[bytes]:
-    """Yield the bytes of a file, each chunk with the end of the one before it."""
+def _overlapping(file: BinaryIO) -> Iterator[bytes]:
+    """Yield the bytes of a file, each chunk with the end of the one before it; of UTF-16 the ASCII characters."""
     tail = b""
     while chunk := file.read(_CHUNK_BYTES):
+        if b"\0" in chunk:
+            chunk = chunk.replace(b"\0", b"")
         yield tail + chunk
         tail = chunk[-_OVERLAP_BYTES:]

@@ -93,7 +93,7 @@ def recognise(path: Path) -> str:
     encoding = osm.detect(head)
     if encoding == "osm" and is_own_osm(head):
         return _OWN_OSM
-    if encoding in {"osm", "osm.gz"}:
+    if encoding in {"osm", "osm.gz", "osm.bz2"}:
         return _LANELET2 if import_module("geofleet.formats.lanelet2_map").is_lanelet2(path) else osm.FORMAT
     if encoding:
         return osm.FORMAT

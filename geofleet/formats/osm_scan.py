@@ -25,7 +25,7 @@ from geofleet.formats.osm_tags import (
     is_sign_key,
     tells_of_signs,
 )
-from geofleet.formats.reading import BZIP2, GZIP, read_head
+from geofleet.formats.reading import BZIP2, GZIP, open_unpacked, read_head
 from geofleet.formats.xml import iter_elements
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def _copy(path: Path, found: str, writer: osmium.SimpleWriter) -> None:
     import osmium  # noqa: PLC0415  (as above)
 
     source = osmium.io.File(str(path), found)
-    if found != "osm" or not _is_in(path, _DELETED):
+    if not _is_in(path, _DELETED):
         osmium.apply(source, writer)
         return
     elements = iter_elements(path, ("node", "way", "relation"))
@@ -187,7 +187,7 @@ def refuse_lanelet2(path: Path) -> None:
 
 def _is_in(path: Path, pattern: re.Pattern[bytes]) -> bool:
     """Tell whether a file holds a short text, a piece at a time."""
-    with path.open("rb") as file:
+    with open_unpacked(path) as file:
         tail = b""
         while chunk := file.read(_CHUNK):
             if pattern.search(tail + chunk):

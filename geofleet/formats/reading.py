@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO, cast
 
 from geofleet.errors import InputError
 
@@ -113,6 +115,15 @@ def read_head(path: Path) -> bytes:
     if not head:
         raise InputError("the file is empty.", where=str(path), todo="Fetch or export it again.")
     return head
+
+
+def open_unpacked(path: Path) -> BinaryIO:
+    """Open a file for reading; one packed with gzip or bzip2 gives what is in it."""
+    with path.open("rb") as file:
+        mark = file.read(len(BZIP2))
+    if mark.startswith(GZIP):
+        return cast("BinaryIO", gzip.open(path))
+    return cast("BinaryIO", bz2.open(path)) if mark == BZIP2 else path.open("rb")
 
 
 def refuse_long_lines(path: Path, *, max_bytes: int = MAX_LINE_BYTES) -> None:

@@ -6,7 +6,7 @@ type, which is refused as soon as it starts; nesting and the length of one tag a
 
 from __future__ import annotations
 
-import gzip
+import bz2
 import math
 import re
 import zlib
@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element as _PlainElement
 from xml.parsers import expat
 
 from geofleet.errors import InputError
-from geofleet.formats.reading import GZIP, read_head
+from geofleet.formats.reading import BZIP2, GZIP, open_unpacked, read_head
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Generator, Iterator
@@ -65,7 +65,7 @@ def iter_elements(
     """Yield the elements with one of some tags, each complete with what is in it, in the order of the file.
 
     An element inside another one that is yielded comes as its descendant and not by itself. Whatever is not inside of
-    such an element takes no memory, and an element is freed when the caller lets it go. Files may be packed with gzip.
+    such an element takes no memory, and an element is freed when the caller lets it go. Files may be packed with gzip or bzip2.
 
     Parameters
     ----------
@@ -84,9 +84,9 @@ def iter_elements(
         The file is missing, empty, truncated or not XML, has another root or a document type, nests deeper than
         `MAX_DEPTH` or has a tag or a text longer than `MAX_TOKEN_BYTES`. The message names the line.
     """
-    head = read_head(path)
+    read_head(path)  # says what is wrong with the file as such
     collector = _Collector(frozenset(tags), root, frozenset(without))
-    with explained(path), _open(path, head) as file:
+    with explained(path), open_unpacked(path) as file:
         for chunk in _chunks(file, collector):
             collector.feed(chunk)
             yield from collector.take()
@@ -257,16 +257,6 @@ class _Collector:
             self._open[-1].text = (self._open[-1].text or "") + text
 
 
-@contextmanager
-def _open(path: Path, head: bytes) -> Iterator[BinaryIO]:
-    with path.open("rb") as file:
-        if head.startswith(GZIP):
-            with gzip.GzipFile(fileobj=file) as packed:
-                yield packed  # type: ignore[misc]  # a GzipFile reads as a BinaryIO does
-        else:
-            yield file
-
-
 def _chunks(file: BinaryIO, collector: _Collector) -> Iterator[bytes]:
     """Yield the bytes of a file, from its declaration on."""
     head = file.read(_HEAD_BYTES)
@@ -285,6 +275,11 @@ def _as_ascii(head: bytes) -> bytes:
         try:
             head = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, _HEAD_BYTES)
         except zlib.error:
+            return b""
+    if head.startswith(BZIP2):
+        try:
+            head = bz2.BZ2Decompressor().decompress(head, _HEAD_BYTES)
+        except (OSError, EOFError):
             return b""
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return head[2:].replace(b"\0", b"")

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import bz2
 import contextlib
 import gzip
 import random
@@ -11,6 +12,7 @@ import shapely
 from pyproj import Geod
 
 from geofleet.errors import ConfigError, InputError
+from geofleet.formats import layers
 from geofleet.formats.lanelet2 import is_lanelet2, read_lanes, read_signs
 from geofleet.formats.lanelet2_lanes import parse_speed_kmh
 from geofleet.tables.store import lonlat
@@ -367,11 +369,25 @@ def test_a_map_of_openstreetmap_is_refused(shared_data):
         read_signs(shared_data / "osm" / "bautzen.osm")
 
 
-def test_packed_with_gzip(tmp_path):
-    packed = tmp_path / "map.osm.gz"
-    packed.write_bytes(gzip.compress(small_map().encode()))
-    assert is_lanelet2(packed)
-    assert read_signs(packed).table["sign_id"].to_pylist() == ["w12"]
+@pytest.mark.parametrize(
+    ("name", "encode"),
+    [
+        ("map.osm.gz", lambda text: gzip.compress(text.encode())),
+        ("map.osm.bz2", lambda text: bz2.compress(text.encode())),
+        ("map.osm", lambda text: ("\ufeff" + text).encode()),
+        ("map.osm", lambda text: text.replace('1.0"', '1.0" encoding="UTF-16"').encode("utf-16")),
+    ],
+)
+def test_packed_or_in_another_encoding(tmp_path, name, encode):
+    path = tmp_path / name
+    path.write_bytes(encode(small_map()))
+    assert layers.recognise(path) == "lanelet2"
+    assert read_signs(path).table["sign_id"].to_pylist() == ["w12"]
+
+
+def test_a_map_without_any_valid_position_is_refused(write):
+    with pytest.raises(InputError, match="none of 6 nodes has a valid position"):
+        read_signs(write(small_map().replace('lat="', 'lat="9')))
 
 
 def test_a_map_without_signs_gives_an_empty_table(write):
