@@ -16,6 +16,7 @@ from geofleet.cli.options import (
     Crs,
     FileFormat,
     Inputs,
+    LayerOption,
     MapInputs,
     Origin,
     Out,
@@ -49,6 +50,7 @@ def ingest_signs(
     columns: Columns = None,
     scheme: SchemeOption = None,
     country: CountryOption = None,
+    layer: LayerOption = None,
     roads: Annotated[bool, typer.Option("--roads/--no-roads", help="Infer facing and road from the ways.")] = True,
     as_json: AsJson = False,
 ) -> None:
@@ -61,6 +63,7 @@ def ingest_signs(
 
     paths = _with_fetched(inputs, place, bbox, cache)
     options = {"crs": crs, "origin": parse_origin(origin), "utm": parse_utm(utm), "scheme": scheme, "country": country}
+    options["layer"] = layer
     with progress_bar("reading signs") as progress:
         result = ingest.ingest_signs(
             paths,

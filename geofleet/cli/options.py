@@ -39,7 +39,7 @@ SchemeOption = Annotated[
 CountryOption = Annotated[
     str | None, typer.Option("--country", help="ISO 3166-1 alpha-2 of codes that do not name it.")
 ]
-LayerOption = Annotated[str | None, typer.Option("--layer", help="Layer of a GeoPackage.")]
+LayerOption = Annotated[str | None, typer.Option("--layer", help="Layer of a GeoPackage, or Shapefile of a zip.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="A TOML file of settings.")]
 Scenario = Annotated[str, typer.Option("--scenario", help="Name of a packaged scenario, or a TOML file.")]

@@ -112,11 +112,7 @@ def _read(path: Path, features: Features, named: Mapping[str, str], options: Map
         return LayerRead(build_table(SIGNS, {name: [] for name in _TEXTS}, _NO_PLACES), features.file_format)
     chosen, guessed = choose_columns(features.table.column_names, named, has_geometry=features.geometry is not None)
     if not chosen.code:
-        raise InputError(
-            f"no column looks like the code of a sign; there are {', '.join(features.table.column_names)[:300]}.",
-            where=str(path),
-            todo='Name it: columns={"code": …}.',
-        )
+        raise _no_code(path, features.table.column_names)
     places = place_features(path, features, chosen, crs=options.get("crs"), swap_xy=bool(options.get("swap_xy")))
     if features.table.num_rows and not len(places.feature):
         reasons = ", ".join(f"{n} {reason}" for reason, n in places.skipped.items())
@@ -138,6 +134,20 @@ def _read(path: Path, features: Features, named: Mapping[str, str], options: Map
     told_all = {reason: count for reason, count in (found | doubtful).items() if count}
     datum = datum_of(places.crs, places.lon, places.lat)
     return LayerRead(signs, features.file_format, dict(skipped), told_all, datum)
+
+
+def _no_code(path: Path, names: Sequence[str]) -> InputError:
+    if not names:
+        return InputError(
+            "geometries without any attribute, so without the code of a sign.",
+            where=str(path),
+            todo="Export it with its attributes; those of a Shapefile are in a .dbf beside it.",
+        )
+    return InputError(
+        f"no column looks like the code of a sign; there are {', '.join(names)[:300]}.",
+        where=str(path),
+        todo="Name it: --columns code=….",
+    )
 
 
 def _settled(

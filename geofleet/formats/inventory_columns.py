@@ -90,10 +90,16 @@ _COMPASS_WORDS = {
 }  # fmt: skip
 _NUMBER = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
 _DATE = re.compile(r"(\d{1,4})[-/.](\d{1,2})[-/.](\d{1,4})(?:[ T](.+))?")
+# The O of a German east is that of a French west, the s of seconds that of the south: left out
+_ANGLE = re.compile(
+    r"(?P<before>[NSEW+-])?\s*(?P<degrees>\d{1,3}(?:\.\d+)?)(?P<degree>\s*[°º:]?\s*)"
+    r"(?:(?P<minutes>\d{1,2}(?:\.\d+)?)\s*['\u2032\u2019:]?\s*)?(?:(?P<seconds>\d{1,2}(?:\.\d+)?)\s*(?:[\"\u2033\u201d]|'')?)?\s*"
+    r"(?P<after>[NSEW])?"
+)
 _EPOCH_MS, _EPOCH_S = 1e11, 1e8
 _MONTHS, _LAST_YEAR = 12, 9999
 _PREVAILING = 0.95
-_MAX_TEXT_BYTES = 1 << 20
+_MAX_TEXT_BYTES, _MAX_WHOLE = 1 << 20, 1e18
 _SHAPEFILE_NAME = 10  # letters of a column name
 
 
@@ -174,12 +180,19 @@ def texts(table: pa.Table, name: str) -> list[str | None]:
     if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     if pa.types.is_floating(column.type):
-        return [None if v is None or v != v else f"{v:.17g}" for v in column.to_pylist()]  # noqa: PLR0124  (NaN)
+        return [None if v is None or v != v else _plain(v) for v in column.to_pylist()]  # noqa: PLR0124  (NaN)
+    if pa.types.is_list(column.type) and pa.types.is_string(column.type.value_type):
+        column = pc.binary_join(column.cast(pa.list_(pa.string())), "|")  # the plates of a stack
     try:
         column = pc.utf8_trim_whitespace(column.cast(pa.string()))
         return list(column.to_pylist())
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError, UnicodeDecodeError) as error:
         raise InputError(f"column {name} cannot be read as text ({error}).", todo="Choose another one.") from None
+
+
+def _plain(value: float) -> str:
+    """Return a number as people write it: whole ones without a point, 274.1 as that and not as its binary neighbour."""
+    return f"{value:.0f}" if value.is_integer() and abs(value) < _MAX_WHOLE else repr(value)
 
 
 def numbers(table: pa.Table, name: str) -> Floats:
@@ -190,6 +203,29 @@ def numbers(table: pa.Table, name: str) -> Floats:
     if pa.types.is_integer(column.type) or pa.types.is_floating(column.type):
         return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False), np.float64)
     return parse_numbers(texts(table, name))
+
+
+def coordinates(table: pa.Table, name: str) -> Floats:
+    """Return a column as numbers, or degrees, minutes and seconds with a sign or a hemisphere as degrees, else NaN."""
+    found = numbers(table, name)
+    lost = np.flatnonzero(np.isnan(found))
+    if len(lost) and not pa.types.is_floating(table[name].type):
+        text = texts(table, name)
+        found = found.copy()
+        found[lost] = [_angle(text[row] or "") for row in lost]
+    return found
+
+
+def _angle(text: str) -> float:
+    """Return `52°30'36.5" N`, `52 30.61 N`, `N 52:30:36`, `52.51 N` or the like as degrees, NaN when it is none."""
+    match = _ANGLE.fullmatch(text.strip().upper().replace(",", "."))
+    if not match or not (match["degree"].strip() or match["before"] or match["after"]):
+        return np.nan
+    degrees, minutes, seconds = (float(match[part] or 0.0) for part in ("degrees", "minutes", "seconds"))
+    if minutes >= 60.0 or seconds >= 60.0:  # noqa: PLR2004  (of a circle)
+        return np.nan
+    side = match["before"] or match["after"] or ""
+    return (-1.0 if side in {"S", "W", "-"} else 1.0) * (degrees + minutes / 60.0 + seconds / 3600.0)
 
 
 def parse_numbers(values: Sequence[str | None]) -> Floats:

@@ -18,8 +18,9 @@ import pyarrow as pa
 import shapely
 
 from geofleet.errors import ConfigError, InputError
+from geofleet.formats.osm_tags import is_sign_key
 from geofleet.formats.reading import read_head
-from geofleet.formats.text_tables import ANSI, NOT_UTF8, encoding_of, read_header
+from geofleet.formats.text_tables import ANSI, NOT_UTF8, encoding_of, read_header, text_of_head
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,6 +31,7 @@ CRS84 = "OGC:CRS84"
 _ZIP, _SQLITE, _SHP, _FGB, _PARQUET = b"PK\x03\x04", b"SQLite format 3\0", b"\x00\x00\x27\x0a", b"fgb\x03", b"PAR1"
 _MARKS = {_SQLITE: "gpkg", _SHP: "shapefile", _FGB: "flatgeobuf", _PARQUET: "parquet", _ZIP: "shapefile.zip"}
 _SEQUENCE = re.compile(rb'(?:\x1e|\s*\{[^\n]*"Feature"[^\n]*\}\s*\n\s*\{)')
+_GEOJSON_TYPE = re.compile(rb'"type"\s*:\s*"(?:Feature|GeometryCollection|(?:Multi)?(?:Point|Line|Poly))')
 _CRS_NAME = re.compile(
     rb'"crs"\s*:\s*\{\s*(?:"type"\s*:\s*"([a-z]+)"\s*,\s*)?"properties"\s*:\s*\{\s*"\w+"\s*:\s*"([^"]*)"'
 )
@@ -39,6 +41,8 @@ _SUFFIXES = {"gpkg": ".gpkg", "flatgeobuf": ".fgb", "shapefile": ".shp"}  # wher
 _OPEN_OPTIONS = {"geojson": {"DATE_AS_STRING": "YES"}, "geojsonseq": {"DATE_AS_STRING": "YES"}}
 _MAX_UNPACKED_BYTES = 4 << 30
 _CSV_BLOCK_BYTES = 16 << 20
+_TAGS = frozenset({"direction", "highway", "maxspeed", "city_limit", "traffic_signals:direction"})
+_GEOMETRY_NAMES = ("geometry", "geom", "wkb_geometry")
 _AGAIN = "Fetch or export it again."
 
 
@@ -76,12 +80,12 @@ def detect(head: bytes) -> str:
     for mark, name in _MARKS.items():
         if head.startswith(mark):
             return name
-    text = head.removeprefix(codecs.BOM_UTF8).lstrip()
+    is_utf16 = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = (text_of_head(head).encode() if is_utf16 else head.removeprefix(codecs.BOM_UTF8)).lstrip()
     if _SEQUENCE.match(text):
         return "geojsonseq"
     if text.startswith((b"{", b"[")):
         return "geojson"
-    is_utf16 = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     if text.startswith(b"<") or (b"\0" in head and not is_utf16):
         return ""
     return "csv" if text else ""
@@ -145,7 +149,7 @@ def _read_gdal(path: Path, found: str, layer: str | None) -> Features:
         except (InputError, ConfigError):
             raise
         except Exception as error:  # noqa: BLE001  (a damaged file makes the binding fail in any way, even by NameError)
-            raise InputError(f"damaged or not {found} ({str(error)[:300]}).", where=str(path), todo=_AGAIN) from None
+            raise _damaged(path, found, str(error)) from None
     name = meta["geometry_name"] or "wkb_geometry"
     notes = {f"GDAL warned: {str(warning.message)[:200]}": 1 for warning in told}
     if n_others:
@@ -156,7 +160,42 @@ def _read_gdal(path: Path, found: str, layer: str | None) -> Features:
     if found in {"geojson", "geojsonseq"}:
         crs = _geojson_crs(path) or CRS84
     geometry = shapely.from_wkb(table[name].to_numpy(zero_copy_only=False), on_invalid="ignore")
-    return Features(table.drop_columns([name]), np.asarray(geometry, object), crs, found, {}, notes)
+    attributes = _with_tags(table.drop_columns([name]))
+    return Features(attributes, np.asarray(geometry, object), crs, found, {}, notes)
+
+
+def _with_tags(table: pa.Table) -> pa.Table:
+    """Return rows of OpenStreetMap whose tags stand as JSON in a column `tags` with a column for each tag of a sign."""
+    if "tags" not in table.column_names or getattr(table["tags"].type, "extension_name", "") != "arrow.json":
+        return table
+    tags = [_tags(text) for text in table["tags"].cast(pa.string()).to_pylist()]
+    for key in sorted({key for one in tags for key in one} - set(table.column_names)):
+        table = table.append_column(key, pa.array([one.get(key) for one in tags], pa.string()))
+    return table
+
+
+def _tags(text: str | None) -> dict[str, str]:
+    """Return the tags in a text that tell of a sign."""
+    try:
+        found = json.loads(text or "{}")
+    except ValueError:
+        return {}
+    kept = found.items() if isinstance(found, dict) else ()
+    return {key: str(value) for key, value in kept if is_sign_key(key) or key in _TAGS}
+
+
+def _damaged(path: Path, found: str, reason: str) -> InputError:
+    """Return why GDAL could not read a file."""
+    head = read_head(path)
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return InputError("GeoJSON in UTF-16, which nobody reads.", where=str(path), todo="Save it as UTF-8.")
+    if found == "geojson" and not _GEOJSON_TYPE.search(head):
+        return InputError(
+            "JSON, but no GeoJSON: it does not begin with features.",
+            where=str(path),
+            todo="Export it as GeoJSON (ArcGIS: f=geojson), or as CSV.",
+        )
+    return InputError(f"damaged or not {found} ({reason[:300]}).", where=str(path), todo=_AGAIN)
 
 
 def _check_name(path: Path, found: str) -> None:
@@ -202,7 +241,7 @@ def _layer(source: str, path: Path, layer: str | None) -> tuple[str, int]:
         raise InputError(
             f"the file has {len(spatial)} layers: {', '.join(spatial)[:300]}.",
             where=str(path),
-            todo="Name one: layer=.",
+            todo=f"Name one: --layer {spatial[0]!r}.",
         )
     if not names:
         raise InputError("the file has no layer.", where=str(path), todo=_AGAIN)
@@ -242,10 +281,15 @@ def _read_parquet(path: Path) -> Features:
     plain = table.replace_schema_metadata(None)
     if raw is None:
         return _with_wkb(Features(plain, None, None, "parquet"))
-    geo = json.loads(raw)
-    name = geo["primary_column"]
-    about = geo["columns"][name]
-    if about["encoding"] == "WKB":
+    try:
+        geo = json.loads(raw)
+        name = geo["primary_column"]
+        about, encoding = geo["columns"][name], geo["columns"][name]["encoding"]
+        plain[name]
+    except (ValueError, KeyError, TypeError) as error:
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else error
+        raise InputError(f"its geo metadata is damaged ({reason}).", where=str(path), todo=_AGAIN) from None
+    if encoding == "WKB":
         geometry = shapely.from_wkb(plain[name].to_numpy(zero_copy_only=False), on_invalid="ignore")
     else:
         import geopandas  # noqa: PLC0415  (only the rare native encodings need it)
@@ -273,13 +317,14 @@ def _parquet_crs(crs: Any, path: Path) -> Any:
 
 
 def _with_wkb(features: Features) -> Features:
-    """Take a column of WKB for the geometry of a Parquet file that does not describe it."""
-    for name in ("geometry", "geom", "wkb_geometry"):
-        if name in features.table.column_names and pa.types.is_binary(features.table.schema.field(name).type):
-            wkb = features.table[name].to_numpy(zero_copy_only=False)
-            geometry = np.asarray(shapely.from_wkb(wkb, on_invalid="ignore"), object)
+    """Take a column of WKB for the geometry of a Parquet file that does not describe it, and nested columns apart."""
+    binary = [f.name for f in features.table.schema if pa.types.is_binary(f.type) or pa.types.is_large_binary(f.type)]
+    for name in sorted(binary, key=lambda name: name not in _GEOMETRY_NAMES):
+        wkb = features.table[name].to_numpy(zero_copy_only=False)
+        geometry = np.asarray(shapely.from_wkb(wkb, on_invalid="ignore"), object)
+        if not shapely.is_missing(geometry).all() or name in _GEOMETRY_NAMES:
             return replace(features, table=features.table.drop_columns([name]), geometry=geometry)
-    return features
+    return replace(features, table=features.table.flatten())
 
 
 def _read_csv(path: Path, encoding: str | None, delimiter: str | None) -> Features:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ import numpy as np
 import shapely
 
 from geofleet.errors import InputError
-from geofleet.formats.inventory_columns import numbers, texts
+from geofleet.formats.inventory_columns import coordinates, texts
 from geofleet.formats.inventory_files import CRS84
 from geofleet.formats.positions import reject_null_island, to_lonlat
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 _POINT, _MULTIPOINT = 0, 4  # shapely.get_type_id
 _LINES = (1, 2, 5)
+_SRID, _HEX = re.compile(r"SRID=(\d{1,6});\s*", re.IGNORECASE), re.compile(r"0[01][0-9a-fA-F]{8,}\Z")
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +88,13 @@ def place_features(
                 f"no geometry, and no columns that look like coordinates; there are "
                 f"{', '.join(features.table.column_names)[:300]}.",
                 where=str(path),
-                todo='Name them: columns={"x": …, "y": …}.',
+                todo="Name them: --columns x=…,y=….",
             )
-        x, y = numbers(features.table, chosen.x), numbers(features.table, chosen.y)
+        x, y = coordinates(features.table, chosen.x), coordinates(features.table, chosen.y)
         feature, is_extended = np.arange(len(x)), np.zeros(len(x), bool)
     x, y = (y, x) if swap_xy else (x, y)
-    assumed = crs is None and features.crs is None
-    crs = crs or features.crs or CRS84
+    stated = crs or features.crs or _srid(geometry)
+    crs, assumed = stated or CRS84, stated is None
     lon, lat = to_lonlat(x, y, crs, where=str(path))
     finite = np.isfinite(x) & np.isfinite(y)
     skipped["coordinates that are no number"] += int((~finite).sum())
@@ -107,13 +109,39 @@ def place_features(
 
 
 def _written(features: Features, chosen: InventoryColumns, skipped: Counter[str]) -> NDArray[np.object_] | None:
-    """Return the geometries that a column of well-known text holds, None without such a column."""
+    """Return the geometries that a column of text holds, None without such a column.
+
+    They are well-known text or bytes in hexadecimal digits, either with an SRID as PostGIS writes them, or GeoJSON.
+    """
     if not chosen.geometry:
         return None
-    text = np.array(texts(features.table, chosen.geometry), object)
-    shapes = np.asarray(shapely.from_wkt(text, on_invalid="ignore"), object)
-    skipped["geometries that are no well-known text"] += int((shapely.is_missing(shapes) & (text != None)).sum())  # noqa: E711  (elementwise)
+    text = texts(features.table, chosen.geometry)
+    shapes = np.full(len(text), None, object)
+    for row, written in enumerate(text):
+        if written:
+            shapes[row] = _shape(written)
+    skipped["geometries that cannot be read"] += int((shapely.is_missing(shapes) & np.array(text, bool)).sum())
     return shapes
+
+
+def _shape(text: str) -> Any:
+    """Return the geometry that a text says, None when it says none."""
+    stated = _SRID.match(text)
+    body = text[stated.end() :] if stated else text
+    read = shapely.from_geojson if body.startswith("{") else shapely.from_wkb if _HEX.match(body) else shapely.from_wkt
+    try:
+        shape = read(body)
+    except (shapely.GEOSException, ValueError):
+        return None
+    return shapely.set_srid(shape, int(stated[1])) if stated and shape is not None else shape
+
+
+def _srid(geometry: NDArray[np.object_] | None) -> str | None:
+    """Return the CRS that all geometries name, None when they name none or several."""
+    if geometry is None:
+        return None
+    named = set(shapely.get_srid(geometry[~shapely.is_missing(geometry)]).tolist())
+    return f"EPSG:{named.pop()}" if len(named) == 1 and named != {0} else None
 
 
 def _points(

@@ -65,7 +65,8 @@ def iter_elements(
     """Yield the elements with one of some tags, each complete with what is in it, in the order of the file.
 
     An element inside another one that is yielded comes as its descendant and not by itself. Whatever is not inside of
-    such an element takes no memory, and an element is freed when the caller lets it go. Files may be packed with gzip or bzip2.
+    such an element takes no memory, and an element is freed when the caller lets it go. Files may be packed (gzip,
+    bzip2).
 
     Parameters
     ----------

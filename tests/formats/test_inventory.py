@@ -637,6 +637,6 @@ def test_a_collection_without_features_is_an_empty_layer(tmp_path):
 
 def test_a_table_whose_positions_cannot_be_read_is_refused(tmp_path):
     path = tmp_path / "dms.csv"
-    path.write_text('id,lon,lat,code\n1,"8°24\'E","49°0\'N",DE:205\n', encoding="utf-8")
+    path.write_text('id,lon,lat,code\n1,"8 east","49 north",DE:205\n', encoding="utf-8")
     with pytest.raises(InputError, match="none of 1 rows has a position that can be used"):
         read_signs(path)

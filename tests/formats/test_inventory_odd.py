@@ -1,0 +1,160 @@
+"""Inventories as other tools write them: places in words, geometry in text or bytes, layers, nested values."""
+
+from __future__ import annotations
+
+import json
+
+import geopandas
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import shapely
+
+from geofleet.errors import ConfigError, InputError
+from geofleet.formats.inventory import read_signs
+from geofleet.formats.inventory_columns import coordinates, texts
+from geofleet.tables.store import lonlat
+
+LON, LAT = 13.4100, 52.5100
+POINT = shapely.Point(LON, LAT)
+
+
+@pytest.fixture
+def write(tmp_path):
+    def make(text, name="signs.csv", encoding="utf-8"):
+        path = tmp_path / name
+        path.write_text(text, encoding=encoding, newline="")
+        return path
+
+    return make
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "52°30'36\" N",
+        "52° 30.6' N",
+        "N 52°30\u203236,0\u2033",
+        "52:30:36N",
+        "52.51 N",
+        "52,51N",
+        "52° 30' 36'' N",
+    ],
+)
+def test_degrees_minutes_and_seconds(text):
+    table = pa.table({"lat": [text, text.replace("N", "S")]})
+    north, south = coordinates(table, "lat")
+    assert north == pytest.approx(52.51)
+    assert south == pytest.approx(-52.51 if "N" in text else 52.51)
+
+
+@pytest.mark.parametrize("text", ["52d30m36s", "52°61'", "13°24' O", "north", "", "1°2'3\"4", "52°30'36\" NS"])
+def test_what_could_be_anything_is_no_angle(text):
+    assert np.isnan(coordinates(pa.table({"lat": [text]}), "lat")).all()
+
+
+def test_a_table_in_degrees_and_minutes(write):
+    layer = read_signs(write("code;lat;lon\n206;52°30'36\"N;13°24'36\"E\n"))
+    assert np.ravel(lonlat(layer.table)) == pytest.approx([LON, LAT])
+
+
+@pytest.mark.parametrize(
+    ("text", "crs"),
+    [
+        (f"POINT ({LON} {LAT})", None),
+        (f"SRID=4326;POINT ({LON} {LAT})", "WGS 84 (EPSG:4326)"),
+        (shapely.to_wkb(POINT, hex=True), None),
+        (shapely.to_wkb(shapely.set_srid(POINT, 4326), hex=True, include_srid=True), "WGS 84 (EPSG:4326)"),
+        (json.dumps({"type": "Point", "coordinates": [LON, LAT]}), None),
+    ],
+)
+def test_geometry_in_a_column_of_text(write, text, crs):
+    quoted = text.replace('"', '""')
+    layer = read_signs(write(f'code,geom\n206,"{quoted}"\n205,nonsense\n'))
+    assert np.ravel(lonlat(layer.table)) == pytest.approx([LON, LAT])
+    assert layer.skipped["geometries that cannot be read"] == 1
+    assert ("no CRS stated, taken as OGC:CRS84" in layer.found) == (crs is None)
+    assert crs is None or layer.datum.crs == crs
+
+
+def test_an_srid_of_metres_is_used(write):
+    x, y = geopandas.GeoSeries([POINT], crs=4326).to_crs(25833).get_coordinates().to_numpy()[0]
+    layer = read_signs(write(f'code;geom\n206;"SRID=25833;POINT ({x} {y})"\n'))
+    assert np.ravel(lonlat(layer.table)) == pytest.approx([LON, LAT], abs=1e-7)
+
+
+def test_layers_are_chosen_by_name_and_listed(tmp_path):
+    frame = geopandas.GeoDataFrame({"code": ["206"]}, geometry=[POINT], crs=4326)
+    path = tmp_path / "two.gpkg"
+    frame.to_file(path, layer="signs")
+    frame.assign(code="205").to_file(path, layer="old")
+    with pytest.raises(InputError, match=r"2 layers: signs, old\. Name one: --layer 'signs'"):
+        read_signs(path)
+    assert read_signs(path, layer="old").table["sign_class"].to_pylist() == ["yield"]
+    with pytest.raises(ConfigError, match="no layer 'new'"):
+        read_signs(path, layer="new")
+
+
+def test_parquet_without_geo_metadata(tmp_path):
+    path = tmp_path / "signs.parquet"
+    pd.DataFrame({"code": ["206"], "photo": [b"\xff\xd8"], "place": [shapely.to_wkb(POINT)]}).to_parquet(path)
+    assert np.ravel(lonlat(read_signs(path).table)) == pytest.approx([LON, LAT])
+    pd.DataFrame({"code": ["206"], "at": [{"lon": LON, "lat": LAT}]}).to_parquet(path)
+    with pytest.raises(InputError, match=r"there are code, at\.lon, at\.lat.*--columns x=…,y=…"):
+        read_signs(path)
+    layer = read_signs(path, columns={"x": "at.lon", "y": "at.lat"})
+    assert np.ravel(lonlat(layer.table)) == pytest.approx([LON, LAT])
+
+
+@pytest.mark.parametrize(
+    ("geo", "message"),
+    [
+        (b"no json", "geo metadata is damaged"),
+        (b"{}", "lacks 'primary_column'"),
+        (b"[]", "geo metadata is damaged"),
+        (b'{"primary_column": "g", "columns": {"g": {"encoding": "WKB"}}}', "geo metadata is damaged"),
+    ],
+)
+def test_damaged_geo_metadata_is_named(tmp_path, geo, message):
+    path = tmp_path / "signs.parquet"
+    pq.write_table(pa.table({"code": ["206"]}).replace_schema_metadata({b"geo": geo}), path)
+    with pytest.raises(InputError, match=message):
+        read_signs(path)
+
+
+def collection(*properties):
+    at = {"type": "Point", "coordinates": [LON, LAT]}
+    features = [{"type": "Feature", "properties": p, "geometry": at} for p in properties]
+    return json.dumps({"type": "FeatureCollection", "features": features})
+
+
+def test_tags_in_an_object_are_those_of_openstreetmap(write):
+    layer = read_signs(write(collection({"tags": {"traffic_sign": "DE:274-50", "name": "x"}}), "signs.geojson"))
+    assert layer.table["sign_class"].to_pylist() == ["speed_limit:50"]
+
+
+def test_a_list_of_codes_is_a_stack(write):
+    rows = read_signs(write(collection({"code": ["206", "1010-13"]}), "signs.geojson")).table.to_pylist()
+    assert [(row["kind"], row["parent_id"]) for row in rows] == [("main", None), ("plate", "row/1")]
+
+
+def test_codes_that_are_numbers_stay_as_written():
+    assert texts(pa.table({"code": [206.0, 274.1, None, 1e17]}), "code") == ["206", "274.1", None, "100000000000000000"]
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding", "message"),
+    [
+        ('[{"code": "206", "lat": 52.5, "lon": 13.4}]', "utf-8", "JSON, but no GeoJSON"),
+        ('{"geometryType": "esriGeometryPoint", "features": []}', "utf-8", "JSON, but no GeoJSON"),
+        (collection({"code": "206"}), "utf-16", "in UTF-16"),
+        (collection({}), "utf-8", "geometries without any attribute"),
+        (json.dumps({"type": "Point", "coordinates": [LON, LAT]}), "utf-8", "geometries without any attribute"),
+        (collection({"code": "206"}) + "}", "utf-8", "damaged or not geojson"),
+    ],
+)
+def test_json_that_is_no_layer_says_why(write, text, encoding, message):
+    with pytest.raises(InputError, match=message):
+        read_signs(write(text, "signs.geojson", encoding))
