@@ -102,6 +102,13 @@ def recognise(path: Path) -> str:
     return _INVENTORY if import_module("geofleet.formats.inventory").detect(head) else ""
 
 
+def unknown(path: Path) -> str:
+    """Say what a file is that no reader takes."""
+    head = read_head(path).lower()
+    is_page = b"<html" in head or b"<!doctype html" in head
+    return "a web page, such as a server sends in place of data" if is_page else "this format is not known"
+
+
 def read_signs(path: Path) -> LayerRead:
     """Read a `signs` table of our own."""
     return LayerRead(read_table(SIGNS, path), _OWN)
@@ -137,7 +144,7 @@ def read_layer(
     """
     found = recognise(path) if file_format == "auto" else file_format
     if found not in FORMATS:
-        what = f"unknown format {found!r}" if found else "this format is not known"
+        what = f"unknown format {found!r}" if found else unknown(path)
         raise InputError(f"{what}.", where=str(path), todo=f"Supported are {SUPPORTED}.")
     layer = FORMATS[found]
     given = {name: value for name, value in options.items() if value is not None}

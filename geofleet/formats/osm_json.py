@@ -13,18 +13,18 @@ from geofleet.errors import InputError
 from geofleet.formats.reading import BZIP2, GZIP
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     import osmium
 
 _ELEMENTS = re.compile(r'"elements"\s*:\s*\[')
 _LOOKS = re.compile(rb'\s*(\xef\xbb\xbf)?\s*\{.*?("elements"\s*:|"generator"\s*:\s*"Overpass|"osm3s"\s*:)', re.DOTALL)
-_REMARK = re.compile(r'"remark"\s*:\s*"([^"]*)"')
+_REMARK = re.compile(r'"remark"\s*:\s*("(?:[^"\\]|\\.)*")')
 _CHUNK = 1 << 20
 _HEAD_BYTES = 4096
 _MAX_ELEMENT_CHARS = 64 << 20
-_TO_READ = "Fetch it again with [out:json], and `out body` or `out geom`."
+AGAIN = "Fetch it again in full, with `out body` or `out geom`."
 
 
 def looks_like(head: bytes) -> bool:
@@ -57,7 +57,7 @@ def bz2_head(path: Path) -> bytes:
         return b""
 
 
-def write_elements(path: Path, writer: osmium.SimpleWriter) -> None:
+def write_elements(answer: Iterable[Mapping[str, Any]], writer: osmium.SimpleWriter, *, where: str) -> None:
     """Write the nodes and ways of an answer to a file of another encoding.
 
     Ways of `out geom` bring their points along; these become nodes.
@@ -70,12 +70,12 @@ def write_elements(path: Path, writer: osmium.SimpleWriter) -> None:
     from osmium.osm.mutable import Node, Way  # noqa: PLC0415  (libosmium is not needed for PBF)
 
     unnamed = 0
-    for element in elements(path):
+    for element in answer:
         kind, number, tags = element.get("type"), element.get("id"), element.get("tags") or {}
         if kind not in {"node", "way"}:
             continue
         if not isinstance(number, int) or not isinstance(tags, dict):
-            raise InputError(f"an element that is none: {str(element)[:80]}.", where=str(path), todo=_TO_READ)
+            raise InputError(f"an element that is none: {str(element)[:80]}.", where=where, todo=AGAIN)
         text = {str(key): str(value) for key, value in tags.items()}
         if kind == "node":
             writer.add_node(Node(id=number, location=_place(element), tags=text))
@@ -116,7 +116,7 @@ def elements(path: Path) -> Iterator[Mapping[str, Any]]:
                 text, at = _more(path, file, text[at:]), 0
                 continue
             if not isinstance(element, dict):
-                raise InputError(f"an element that is none: {str(element)[:80]}.", where=str(path), todo=_TO_READ)
+                raise InputError(f"an element that is none: {str(element)[:80]}.", where=str(path), todo=AGAIN)
             yield element
 
 
@@ -131,9 +131,9 @@ def _up_to_elements(path: Path, file: IO[str]) -> str:
     """Return what was read, from the first element on."""
     text = file.read(_CHUNK)
     match = _ELEMENTS.search(text)
+    _refuse_remark(path, text[: match.start()] if match else text)
     if not match:
-        _refuse_remark(path, text)
-        raise InputError("an Overpass answer without elements.", where=str(path), todo=_TO_READ)
+        raise InputError("an Overpass answer without elements.", where=str(path), todo=AGAIN)
     return text[match.end() :]
 
 
@@ -141,13 +141,13 @@ def _refuse_remark(path: Path, text: str) -> None:
     """Refuse an answer that says that it is not all: a query that timed out gives what it had, and a remark."""
     remark = _REMARK.search(text)
     if remark and "error" in remark[1]:
-        raise InputError(f"Overpass could not answer in full ({remark[1]}).", where=str(path), todo=_TO_READ)
+        raise InputError(f"Overpass could not answer in full ({json.loads(remark[1])}).", where=str(path), todo=AGAIN)
 
 
 def _more(path: Path, file: IO[str], rest: str) -> str:
     more = file.read(_CHUNK + len(rest))
     if not more or len(rest) > _MAX_ELEMENT_CHARS:
-        raise InputError("the Overpass answer is cut off or damaged.", where=str(path), todo=_TO_READ)
+        raise InputError("the Overpass answer is cut off or damaged.", where=str(path), todo=AGAIN)
     return rest + more
 
 
@@ -160,5 +160,5 @@ def _past(text: str, at: int, letters: str) -> int:
 def _place(point: Mapping[str, Any]) -> tuple[float, float]:
     lon, lat = point.get("lon"), point.get("lat")
     if not isinstance(lon, int | float) or not isinstance(lat, int | float):
-        raise InputError(f"a position that is none: {str(point)[:80]}.", todo=_TO_READ)
+        raise InputError(f"a position that is none: {str(point)[:80]}.", todo=AGAIN)
     return float(lon), float(lat)

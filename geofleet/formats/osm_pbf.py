@@ -4,8 +4,8 @@ Blocks are unpacked on threads of their own and decoded as arrays, numbers of a 
 what is looked for are passed over by a search in their string table, so that a file is read about as fast as it
 unpacks, and memory holds a few blocks whatever its size.
 
-Read are dense nodes and ways in raw or zlib blobs, which is what every usual writer makes. Anything else that the
-format allows raises `UnusualPbfError`; libosmium can rewrite such a file.
+Read are dense nodes and ways, which is what every usual writer makes. Anything else that the format allows raises
+`UnusualPbfError`; libosmium can rewrite such a file.
 """
 
 from __future__ import annotations
@@ -16,45 +16,32 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from geofleet.errors import InputError
+from geofleet.formats.osm_blobs import UnusualPbfError, check_features, read_blobs, unpack
+from geofleet.formats.protobuf import BYTES, VARINT, DamagedPbfError, deltas, fields, signed, varint, varints
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from concurrent.futures import Future
     from pathlib import Path
-    from typing import BinaryIO
 
     from numpy.typing import NDArray
 
+    from geofleet.formats.protobuf import Span
+
     Ints = NDArray[np.int64]
 
-__all__ = ["Block", "DenseNodes", "Strings", "UnusualPbfError", "deltas", "read_blocks", "varints", "varints_of"]
+__all__ = ["Block", "DenseNodes", "Strings", "UnusualPbfError", "read_blocks"]
 
-_MAX_HEADER_BYTES = 64 * 1024
-_MAX_BLOB_BYTES = 32 * 1024 * 1024
-_MAX_VARINT_BYTES = 10
-_READ = frozenset({"OsmSchema-V0.6", "DenseNodes"})
 _THREADS, _AHEAD = 2, 4
 _NANO_PER_E7 = 100
-_PEEK_BYTES = 32
-_VARINT, _BYTES = 0, 2
-_FIXED_BYTES = {1: 8, 5: 4}
 _WAY_FIELDS = ((1, 0), (2, b""), (3, b""), (8, b""))  # id, keys, values, refs
 
 _T = TypeVar("_T")
-Span = tuple[int, int]
-
-
-class UnusualPbfError(Exception):
-    """A valid file that uses a rare part of the format: another compression, nodes that are not dense, history."""
-
-
-class DamagedPbfError(ValueError):
-    """The bytes are not what the format allows; `read_blocks` tells where."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +97,7 @@ class Strings:
 
     def __getitem__(self, index: int) -> bytes:
         at, end = self.start[index], self.start[index + 1]
-        return self.data[at + 2 : end] if self.data[at + 1] < 0x80 else self.data[_varint(self.data, at + 1)[1] : end]  # noqa: PLR2004 - as above
+        return self.data[at + 2 : end] if self.data[at + 1] < 0x80 else self.data[varint(self.data, at + 1)[1] : end]  # noqa: PLR2004 - as above
 
     def numbers(self, field: bytes, *, whole: bool) -> Iterator[int]:
         """Yield the numbers of the strings whose field has these bytes somewhere after its head, or is these bytes."""
@@ -132,13 +119,13 @@ class Block:
     def _parts(self) -> tuple[Span, list[Span], dict[int, int]]:
         """Return where the string table and the groups lie, and the numbers by field."""
         strings, groups, numbers = (0, 0), [], {17: 100, 19: 0, 20: 0}
-        for number, value in _fields(self.data, (0, len(self.data))):
+        for number, value in fields(self.data, (0, len(self.data))):
             if number == 1 and isinstance(value, tuple):
                 strings = value
             elif number == 2 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's
                 groups.append(value)
             elif isinstance(value, int):
-                numbers[number] = _signed(value)
+                numbers[number] = signed(value)
         return strings, groups, numbers
 
     def holds_string(self, text: bytes) -> bool:
@@ -162,7 +149,7 @@ class Block:
         _, groups, numbers = self._parts
         for group in groups:
             # A group holds things of one kind, and dense nodes are one field.
-            number, value = next(_fields(self.data, group), (0, 0))
+            number, value = next(fields(self.data, group), (0, 0))
             if number == 1:
                 raise UnusualPbfError("nodes that are not dense")
             if number == 2 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's
@@ -170,12 +157,12 @@ class Block:
 
     def has_nodes(self) -> bool:
         """Tell whether the block holds nodes, without decoding them."""
-        return any(next(_fields(self.data, group), (0, 0))[0] in {1, 2} for group in self._parts[1])
+        return any(next(fields(self.data, group), (0, 0))[0] in {1, 2} for group in self._parts[1])
 
     def ways(self, is_wanted: Callable[[bytes], bool]) -> Iterator[tuple[int, bytes, bytes, bytes]]:
         """Yield id, packed keys, packed values and packed references of the ways whose packed keys are wanted."""
         for group in self._parts[1]:
-            for number, value in _fields(self.data, group):
+            for number, value in fields(self.data, group):
                 if number != 3:  # noqa: PLR2004 - field numbers are the format's
                     break
                 if isinstance(value, tuple):
@@ -184,15 +171,15 @@ class Block:
                         yield way
 
     def _way(self, span: Span) -> tuple[int, bytes, bytes, bytes]:
-        # The same as `_fields` in one loop: ways are what a file has most of, and each has five fields.
+        # The same as `fields` in one loop: ways are what a file has most of, and each has five fields.
         data, (at, end) = self.data, span
         found: dict[int, int | bytes] = {}
         while at < end:
-            key, at = (data[at], at + 1) if data[at] < 0x80 else _varint(data, at)  # noqa: PLR2004 - one byte
-            size, at = (data[at], at + 1) if data[at] < 0x80 else _varint(data, at)  # noqa: PLR2004 - as above
-            if key & 7 == _VARINT:
+            key, at = (data[at], at + 1) if data[at] < 0x80 else varint(data, at)  # noqa: PLR2004 - one byte
+            size, at = (data[at], at + 1) if data[at] < 0x80 else varint(data, at)  # noqa: PLR2004 - as above
+            if key & 7 == VARINT:
                 found[key >> 3] = size
-            elif key & 7 == _BYTES and at + size <= end:
+            elif key & 7 == BYTES and at + size <= end:
                 found[key >> 3] = data[at : at + size]
                 at += size
             else:
@@ -202,11 +189,11 @@ class Block:
             raise DamagedPbfError("a way without its fields")
         if not (isinstance(values, bytes) and isinstance(refs, bytes)):
             raise DamagedPbfError("a way without its fields")
-        return _signed(way_id), keys, values, refs
+        return signed(way_id), keys, values, refs
 
     def _dense(self, span: Span, numbers: dict[int, int], *, tagged: bool) -> DenseNodes:
         packed = {1: b"", 8: b"", 9: b"", 10: b""}
-        for number, value in _fields(self.data, span):
+        for number, value in fields(self.data, span):
             if isinstance(value, tuple):
                 packed[number] = self.data[slice(*value)]
         node_id, lat, lon = (deltas(packed[number]) for number in (1, 8, 9))
@@ -214,49 +201,6 @@ class Block:
             raise DamagedPbfError("ids and positions differ in number")
         lat_e7, lon_e7 = (_e7(numbers[offset] + numbers[17] * side) for offset, side in ((19, lat), (20, lon)))
         return DenseNodes(node_id, lon_e7, lat_e7, varints(packed[10]) if tagged else np.zeros(0, np.int64))
-
-
-def varints(packed: bytes) -> Ints:
-    """Decode packed unsigned numbers, as 64 bits whose sign is the reader's affair."""
-    raw = np.frombuffer(packed, np.uint8)
-    if not len(raw):
-        return np.zeros(0, np.int64)
-    ends = np.flatnonzero(raw < 0x80)  # noqa: PLR2004 - the top bit says that more bytes follow
-    if not len(ends) or ends[-1] != len(raw) - 1:
-        raise DamagedPbfError("a number that does not end")
-    if len(ends) == len(raw):
-        return raw.astype(np.int64)
-    starts = np.concatenate(([0], ends[:-1] + 1))
-    n_more = ends - starts
-    most = int(n_more.max())
-    if most >= _MAX_VARINT_BYTES:
-        raise DamagedPbfError("a number of more than ten bytes")
-    kind: Any = np.uint32 if most < 4 else np.uint64  # noqa: PLR2004 - 28 bits in four bytes
-    low = raw & 0x7F
-    value: NDArray[Any] = low[starts].astype(kind)
-    n_more = n_more.astype(np.uint8)
-    for place in range(1, most + 1):
-        rows = np.flatnonzero(n_more >= place)
-        value[rows] |= low[starts[rows] + place].astype(kind) << kind(7 * place)
-    return value.astype(np.uint64).view(np.int64)
-
-
-def varints_of(parts: list[bytes]) -> tuple[Ints, Ints]:
-    """Decode many packed sequences at once; return their numbers and where each begins, with the total last."""
-    joined = b"".join(parts)
-    numbers = varints(joined)
-    ends = np.cumsum([0, *map(len, parts)])
-    is_last = np.frombuffer(joined, np.uint8) < 0x80  # noqa: PLR2004 - the top bit says that more bytes follow
-    if not is_last[ends[1:][np.diff(ends) > 0] - 1].all():
-        raise DamagedPbfError("a number that does not end")
-    return numbers, np.concatenate(([0], np.cumsum(is_last)))[ends]
-
-
-def deltas(packed: bytes) -> Ints:
-    """Decode packed, zigzag-coded differences to the numbers themselves."""
-    coded = varints(packed).view(np.uint64)
-    half = (coded >> np.uint64(1)).view(np.int64)
-    return np.cumsum(np.where(coded & np.uint64(1), ~half, half))
 
 
 def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = False) -> Iterator[_T]:
@@ -276,11 +220,11 @@ def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = F
         waiting: deque[tuple[int, Future[bytes]]] = deque()
         at = 0
         try:
-            for begin, kind, blob in _blobs(file):
+            for begin, kind, blob in read_blobs(file):
                 if kind == b"OSMHeader":
-                    _check_features(_unpack(blob))
+                    check_features(unpack(blob))
                 elif kind == b"OSMData":
-                    waiting.append((begin, pool.submit(_unpack, blob, nodes_only=nodes_only)))
+                    waiting.append((begin, pool.submit(unpack, blob, nodes_only=nodes_only)))
                 if len(waiting) >= _AHEAD:
                     at, done = waiting.popleft()
                     yield work(Block(done.result()))
@@ -296,131 +240,6 @@ def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = F
         finally:
             for _, done in waiting:
                 done.cancel()
-
-
-def _blobs(file: BinaryIO) -> Iterator[tuple[int, bytes, bytes]]:
-    """Yield the place, kind and content of every blob."""
-    while True:
-        at = file.tell()
-        head = file.read(4)
-        if not head:
-            return
-        size = int.from_bytes(head, "big")
-        if len(head) < 4 or size > _MAX_HEADER_BYTES:  # noqa: PLR2004 - the length of a length
-            raise DamagedPbfError("no block begins here")
-        kind, size = _blob_header(_exactly(file, size))
-        yield at, kind, _exactly(file, size)
-
-
-def _exactly(file: BinaryIO, size: int) -> bytes:
-    content = file.read(size)
-    if len(content) < size:
-        raise DamagedPbfError("the file is truncated")
-    return content
-
-
-def _blob_header(header: bytes) -> tuple[bytes, int]:
-    kind, size = b"", -1
-    for number, value in _fields(header, (0, len(header))):
-        if number == 1 and isinstance(value, tuple):
-            kind = header[slice(*value)]
-        elif number == 3 and isinstance(value, int):  # noqa: PLR2004 - field numbers are the format's
-            size = value
-    if not 0 <= size <= _MAX_BLOB_BYTES:
-        raise DamagedPbfError(f"a block of {size} bytes")
-    return kind, size
-
-
-def _unpack(blob: bytes, *, nodes_only: bool = False) -> bytes:
-    """Return the content of a blob, of at most 32 MiB as the format has it, whatever it would grow to."""
-    packed: Span | None = None
-    raw_size = 0
-    for number, value in _fields(blob, (0, len(blob))):
-        if number == 1 and isinstance(value, tuple):
-            return blob[slice(*value)]
-        if number == 2 and isinstance(value, int):  # noqa: PLR2004 - field numbers are the format's
-            raw_size = value
-        elif number == 3 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's
-            packed = value
-        else:
-            raise UnusualPbfError("blobs that are packed otherwise than by zlib")
-    if packed is None or not 0 <= raw_size <= _MAX_BLOB_BYTES:
-        raise DamagedPbfError(f"a block that would unpack to {raw_size} bytes")
-    content = memoryview(blob)[slice(*packed)]
-    return b"" if nodes_only and _is_without_nodes(content, raw_size) else _inflated(content, raw_size)
-
-
-def _inflated(packed: memoryview, raw_size: int) -> bytes:
-    unpacker = zlib.decompressobj()
-    content = unpacker.decompress(packed, max(raw_size, 1))
-    if len(content) != raw_size or unpacker.unconsumed_tail:
-        raise DamagedPbfError("a block whose size is not the one it states")
-    return content
-
-
-def _is_without_nodes(packed: memoryview, raw_size: int) -> bool:
-    """Tell whether a block is one group of ways or relations, by its first bytes and what follows its strings."""
-    unpacker = zlib.decompressobj()
-    head = unpacker.decompress(packed, _PEEK_BYTES)
-    if head[:1] != b"\x0a":
-        return False
-    size, at = _varint(head, 1)
-    if at + size + _PEEK_BYTES > raw_size:
-        return False
-    beyond = at + size + _PEEK_BYTES - len(head)
-    if beyond > 0:
-        head += unpacker.decompress(unpacker.unconsumed_tail, beyond)
-    at += size
-    if len(head) < at + _PEEK_BYTES or head[at] != 0x12:  # noqa: PLR2004 - field 2, bytes: a group
-        return False
-    size, at = _varint(head, at + 1)
-    return at + size == raw_size and head[at] >> 3 > 2  # noqa: PLR2004 - ways, relations, changesets
-
-
-def _check_features(header: bytes) -> None:
-    """Refuse what the reader would have to know about, as the format asks."""
-    for number, value in _fields(header, (0, len(header))):
-        if number == 4 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's
-            feature = header[slice(*value)].decode(errors="replace")
-            if feature not in _READ:
-                raise UnusualPbfError(f"the feature {feature}")
-
-
-def _fields(data: bytes, span: Span) -> Iterator[tuple[int, int | Span]]:
-    """Yield number and value of the fields of a message: an integer, or where the bytes lie."""
-    at, end = span
-    while at < end:
-        key, at = _varint(data, at)
-        wire = key & 7
-        if wire == _VARINT:
-            value, at = _varint(data, at)
-            yield key >> 3, value
-            continue
-        size, at = _varint(data, at) if wire == _BYTES else (_FIXED_BYTES.get(wire, -1), at)
-        if size < 0 or at + size > end:
-            raise DamagedPbfError("a field beyond its end")
-        yield key >> 3, (at, at + size)
-        at += size
-
-
-def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """Return a number and where it ends."""
-    value = data[at]
-    if value < 0x80:  # noqa: PLR2004 - the top bit says that more bytes follow
-        return value, at + 1
-    value &= 0x7F
-    for shift in range(7, 7 * _MAX_VARINT_BYTES, 7):
-        at += 1
-        value |= (data[at] & 0x7F) << shift
-        if data[at] < 0x80:  # noqa: PLR2004 - as above
-            return value, at + 1
-    raise DamagedPbfError("a number of more than ten bytes")
-
-
-def _signed(value: int) -> int:
-    """Return a number of two's complement, 64 bits."""
-    value &= (1 << 64) - 1
-    return value - (1 << 64) if value >> 63 else value
 
 
 def _e7(nano: Ints) -> Ints:

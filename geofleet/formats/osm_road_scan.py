@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geofleet.formats.osm_pbf import Block, read_blocks, varints_of
+from geofleet.formats.osm_pbf import Block, read_blocks
 from geofleet.formats.osm_roads import Roads
 from geofleet.formats.osm_tags import CAR_ROADS, ROAD_KEYS, is_drivable, oneway_of, speed_kmh
+from geofleet.formats.protobuf import varints_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

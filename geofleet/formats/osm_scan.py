@@ -17,6 +17,7 @@ import numpy as np
 
 from geofleet.errors import InputError
 from geofleet.formats import osm_json
+from geofleet.formats.osm_copy import copy_as_pbf
 from geofleet.formats.osm_pbf import Block, DenseNodes, Strings, UnusualPbfError, read_blocks
 from geofleet.formats.osm_spool import NODE, NodeSpool
 from geofleet.formats.osm_tags import (
@@ -26,12 +27,10 @@ from geofleet.formats.osm_tags import (
     tells_of_signs,
 )
 from geofleet.formats.reading import BZIP2, GZIP, open_unpacked, read_head
-from geofleet.formats.xml import iter_elements
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    import osmium
     from numpy.typing import NDArray
 
     Ints = NDArray[np.int64]
@@ -40,7 +39,6 @@ _T = TypeVar("_T")
 _PBF_MARK = b"OSMHeader"
 _MARK_WITHIN = 1024
 _LANELET = re.compile(rb"""v=["']lanelet["']""")
-_DELETED = re.compile(rb"""action=["']delete["']""")
 _CHUNK, _OVERLAP = 1 << 20, 64
 _TAG_BYTES = 16  # two numbers
 _HIGHWAY = b"\n\x07highway"
@@ -119,38 +117,8 @@ def scan(path: Path, work: Callable[[Path], _T]) -> _T:
                 pass  # libosmium reads it, and writes what is read here
         with tempfile.TemporaryDirectory(prefix="geofleet-") as folder:
             copy = Path(folder) / "map.osm.pbf"
-            _rewrite(path, found, copy)
+            copy_as_pbf(path, found, copy)
             return work(copy)
-
-
-def _rewrite(path: Path, found: str, copy: Path) -> None:
-    import osmium  # noqa: PLC0415  (libosmium is not needed for PBF)
-
-    if found == "osm.bz2" and osm_json.looks_like(osm_json.bz2_head(path)):
-        found = "json.bz2"
-    with osmium.SimpleWriter(str(copy)) as writer:
-        if found.startswith("json"):
-            osm_json.write_elements(path, writer)
-        else:
-            try:
-                _copy(path, found, writer)
-            except osmium.InvalidLocationError as error:
-                raise ValueError(*error.args) from None
-
-
-def _copy(path: Path, found: str, writer: osmium.SimpleWriter) -> None:
-    """Write what a file of XML holds, without what an editor has marked as deleted."""
-    import osmium  # noqa: PLC0415  (as above)
-
-    source = osmium.io.File(str(path), found)
-    if not _is_in(path, _DELETED):
-        osmium.apply(source, writer)
-        return
-    elements = iter_elements(path, ("node", "way", "relation"))
-    gone = {(e.tag[0], e.get("id", "")) for e in elements if e.get("action") == "delete"}
-    for item in osmium.FileProcessor(source):
-        if (item.type_str(), str(item.id)) not in gone:
-            writer.add(item)
 
 
 @contextmanager

@@ -108,7 +108,7 @@ def kind_of(path: Path) -> str:
         return _kind_of_rows(path, is_drive=bool(drive))
     if not found:
         raise InputError(
-            "this format is not known.",
+            f"{layers.unknown(path)}.",
             where=str(path),
             todo=f"Supported are {layers.SUPPORTED}; drives: {', '.join(drives.FORMATS.values())}.",
         )

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import bz2
+import lzma
 import random
 import zlib
 
 import numpy as np
 import osmium
+import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,10 +16,11 @@ from osmium.osm.mutable import Node, Way
 
 from geofleet.errors import InputError
 from geofleet.formats.osm import read_lanes, read_signs
-from geofleet.formats.osm_pbf import Strings, UnusualPbfError, deltas, read_blocks, varints
+from geofleet.formats.osm_pbf import Strings, UnusualPbfError, read_blocks
 from geofleet.formats.osm_road_scan import read_roads
 from geofleet.formats.osm_scan import sign_nodes
 from geofleet.formats.osm_tags import POINT_HIGHWAYS, is_drivable, is_sign_key
+from geofleet.formats.protobuf import deltas, varints
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 
@@ -55,11 +59,21 @@ def dense(nodes: list[tuple[int, int, int, list[int]]]) -> bytes:
     return field(2, field(1, columns[0]) + field(8, columns[1]) + field(9, columns[2]) + field(10, tags))
 
 
+PACKINGS = {
+    "zlib": (3, zlib.compress),
+    "lzma": (4, lambda content: lzma.compress(content, lzma.FORMAT_ALONE)),
+    "bzip2": (5, bz2.compress),
+    "lz4": (6, lambda content: pa.Codec("lz4_raw").compress(content, asbytes=True)),
+    "zstd": (7, lambda content: pa.Codec("zstd").compress(content, asbytes=True)),
+}
+
+
 def blob(kind: bytes, content: bytes, how: str = "zlib") -> bytes:
     if how == "raw":
         body = field(1, content)
     else:
-        body = packed(2 << 3) + packed(len(content)) + field({"zlib": 3, "lzma": 4}[how], zlib.compress(content))
+        number, pack = PACKINGS[how]
+        body = packed(2 << 3) + packed(len(content)) + field(number, pack(content))
     header = field(1, kind) + packed(3 << 3) + packed(len(body))
     return len(header).to_bytes(4, "big") + header + body
 
@@ -101,7 +115,7 @@ def all_of(nodes):
     return np.concatenate(list(nodes.spool.chunks()))
 
 
-@pytest.mark.parametrize("how", ["zlib", "raw"])
+@pytest.mark.parametrize("how", ["zlib", "raw", "lzma", "lz4", "zstd"])
 def test_a_block_by_hand(tmp_path, how):
     nodes = sign_nodes(pbf(tmp_path / "a.pbf", block(STRINGS, SIGN), how=how))
     found = [(n, x, y, nodes.tagsets[s]) for n, x, y, s in all_of(nodes).tolist()]
@@ -184,6 +198,24 @@ def test_damage_is_named_with_its_place(tmp_path, content, message):
     with pytest.raises(InputError, match=message) as caught:
         read_signs(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("how", ["lzma", "lz4", "zstd"])
+def test_a_packed_block_that_lies_or_is_damaged_is_refused(tmp_path, how):
+    number, pack = PACKINGS[how]
+    whole = pack(block(STRINGS, SIGN))
+    for content, size in ((whole, 3), (whole, 1 << 20), (whole[: len(whole) // 2], 300), (b"nonsense" * 4, 300)):
+        body = packed(2 << 3) + packed(size) + field(number, content)
+        header = field(1, b"OSMData") + packed(3 << 3) + packed(len(body))
+        path = pbf(tmp_path / "a.osm.pbf")
+        path.write_bytes(path.read_bytes() + len(header).to_bytes(4, "big") + header + body)
+        with pytest.raises(InputError, match="damaged, or not an OpenStreetMap file"):
+            read_signs(path)
+
+
+def test_an_obsolete_packing_is_refused(tmp_path):
+    with pytest.raises(InputError, match="unknown compression"):
+        read_signs(pbf(tmp_path / "a.osm.pbf", block(STRINGS, SIGN), how="bzip2"))
 
 
 def test_a_block_that_would_fill_the_memory_is_refused(tmp_path):
