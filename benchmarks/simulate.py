@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from geofleet.algorithms.kalman import track_kalman
-from geofleet.algorithms.sensing import FrameDetections, sense_pass
+from geofleet.algorithms.sensing_chain import sense_pass
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import TrackerModel, track_paper
 from geofleet.config import load_config
@@ -36,6 +36,7 @@ from geofleet.tables.fleets import Fleet, load_fleet
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from geofleet.algorithms.sensing import FrameDetections
     from geofleet.algorithms.trajectory import Poses
 
 RAW = Path(__file__).parent.parent / "data" / "raw"

@@ -14,19 +14,22 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from geofleet.algorithms.kalman import track_kalman
-from geofleet.algorithms.sensing import FrameDetections, sense_pass
+from geofleet.algorithms.sensing_chain import sense_pass
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import track_ideal, track_paper, track_pass
 from geofleet.config import load_config
 from geofleet.formats.layers import read_layer
 from geofleet.steps.ingest import ingest_drive, ingest_signs
 from geofleet.tables.fleets import Fleet, load_fleet
+
+if TYPE_CHECKING:
+    from geofleet.algorithms.sensing import FrameDetections
 
 RAW = Path(__file__).resolve().parents[1] / "data" / "raw"
 DRIVES = {"demo drive": "helsinki_derived.pos", "second drive": "helsinki_derived_b.pos"}

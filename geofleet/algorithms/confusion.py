@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
+    from geofleet.algorithms.streams import PassesRandom
+
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
 
@@ -46,7 +48,7 @@ def confusion_matrix(group: Sequence[str], *, semantic_rate: float, in_group: fl
     return matrix
 
 
-def read_classes(true_class: Ints, matrix: Floats, rng: Generator) -> Ints:
+def read_classes(true_class: Ints, matrix: Floats, rng: Generator | PassesRandom) -> Ints:
     """Draw a read class for each true one, by a row of the matrix each."""
     upto = np.cumsum(matrix, axis=1)
     upto[:, -1] = 1.0  # rounding must not leave a gap

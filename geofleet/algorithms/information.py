@@ -53,7 +53,7 @@ class PolarNoise:
 
 @dataclass(frozen=True, slots=True)
 class PassBias:
-    """Range bias (m) and bearing bias (rad) of a pass, shape (2,), and their covariance, shape (2, 2)."""
+    """Range bias (m) and bearing bias (rad) of passes, shape (n_passes, 2), and covariances, (n_passes, 2, 2)."""
 
     mean: Floats
     cov: Floats
@@ -107,17 +107,22 @@ class TrackRows:
         rows = np.repeat(kept, count)
         return TrackRows(np.concatenate(([0], np.cumsum(count[kept]))).astype(np.int64), self.order[rows])
 
+    def pass_of(self, seen: FrameDetections) -> Ints:
+        """Return the number of the pass of each track; a track has one detection at least."""
+        return seen.pass_of(seen.frame[self.order[self.start[:-1]]])
+
 
 def information_form(
     seen: FrameDetections, reported: Poses, rows: TrackRows, noise: PolarNoise, bias: Floats
 ) -> Information:
-    """Return N and r of each track, linearised at the place that its frames agree on under a bias of the pass.
+    """Return N and r of each track, linearised at the place that its frames agree on under the bias of its pass.
 
     The place is found by Gauss-Newton steps that are damped until the residual falls (Levenberg-Marquardt), from the
     mean of the reported positions: without damping a track seen from one direction only runs away.
     """
     poses = np.ascontiguousarray(reported.xy_m[seen.frame])
     sigmas = np.array([noise.range_sigma_m, noise.bearing_sigma_rad])
+    bias = bias[rows.pass_of(seen)]
     place = locate(rows.start, rows.order, seen.xy_m, seen.range_m, seen.azimuth_rad, poses, sigmas, bias)
     matrix, gradient, square = normal_equations(
         rows.start, rows.order, seen.range_m, seen.azimuth_rad, poses, sigmas, bias, place
@@ -129,7 +134,7 @@ def information_form(
     return Information(
         origin_xy_m=place,
         matrix=matrix,
-        vector=gradient + matrix[:, :, 2:] @ bias,
+        vector=gradient + (matrix[:, :, 2:] @ bias[:, :, None])[:, :, 0],
         s0=np.maximum(square - explained, 0.0),
         dof=2.0 * np.diff(rows.start) - is_seen.sum(axis=1),
     )
@@ -142,20 +147,30 @@ def _scale(noise: PolarNoise) -> Floats:
 
 
 def pass_bias(seen: FrameDetections, reported: Poses, rows: TrackRows, noise: PolarNoise) -> PassBias:
-    """Return the bias of a pass from its own tracks (`bias_posterior`).
+    """Return the bias of each pass from its own tracks (`bias_posterior`).
 
     Tracks whose residual is beyond `OUTLIER_SIGMAS` are left out: two signs in one track say nothing about the sensor.
     """
-    mean, cov = np.zeros(2), noise.bias_cov
-    long_enough = np.diff(rows.start) >= MIN_FRAMES
-    if not cov.any() or not long_enough.any():
+    n_passes = len(seen.pass_start) - 1
+    mean, cov = np.zeros((n_passes, 2)), np.tile(noise.bias_cov, (n_passes, 1, 1))
+    rows = rows.at_least(MIN_FRAMES)
+    if not cov.any() or len(rows.start) == 1:
         return PassBias(mean, cov)
+    of_pass = rows.pass_of(seen)
+    has_tracks = np.bincount(of_pass, minlength=n_passes) > 0
     for _ in range(N_ROUNDS):
         form = information_form(seen, reported, rows, noise, mean)
-        used = long_enough & (form.s0 <= form.dof + OUTLIER_SIGMAS * np.sqrt(2 * np.maximum(form.dof, 1)))
+        used = form.s0 <= form.dof + OUTLIER_SIGMAS * np.sqrt(2 * np.maximum(form.dof, 1))
         schur, right = about_bias(form.matrix[used], form.vector[used])
-        mean, cov = bias_posterior(schur.sum(axis=0), right.sum(axis=0), np.sqrt(np.diag(noise.bias_cov)))
+        says = _by_pass(np.column_stack((schur.reshape(-1, 4), right)), of_pass[used], n_passes)
+        found = bias_posterior(says[:, :4].reshape(-1, 2, 2), says[:, 4:], np.sqrt(np.diag(noise.bias_cov)))
+        mean[has_tracks], cov[has_tracks] = found[0][has_tracks], found[1][has_tracks]
     return PassBias(mean, cov)
+
+
+def _by_pass(values: Floats, of_pass: Ints, n_passes: int) -> Floats:
+    """Return the sums of rows (n, k) by pass, (n_passes, k)."""
+    return np.column_stack([np.bincount(of_pass, column, n_passes) for column in values.T])
 
 
 def about_bias(matrix: Floats, vector: Floats) -> tuple[Floats, Floats]:

@@ -71,19 +71,26 @@ def locate(  # noqa: PLR0917 - numba takes no keyword-only arguments
     sigma: Floats,
     bias: Floats,
 ) -> Floats:
-    """Return the place of each track that its ranges and azimuths agree on, by damped Gauss-Newton steps."""
+    """Return the place of each track that its ranges and azimuths agree on, by damped Gauss-Newton steps.
+
+    `bias` is that of the pass of each track, shape (n_tracks, 2).
+    """
     place = np.zeros((len(start) - 1, 2))
     for t in range(len(place)):
         rows = order[start[t] : start[t + 1]]
         for i in rows:
             place[t] += xy_m[i] / len(rows)
         east, north, damping = place[t, 0], place[t, 1], 1e-3
-        ee, en, nn, ge, gn, square = _place_equations(rows, east, north, range_m, azimuth_rad, pose_xy_m, sigma, bias)
+        ee, en, nn, ge, gn, square = _place_equations(
+            rows, east, north, range_m, azimuth_rad, pose_xy_m, sigma, bias[t]
+        )
         for _ in range(N_STEPS):
             a, b = ee * (1 + damping), nn * (1 + damping)
             det = a * b - en * en
             step_e, step_n = (b * ge - en * gn) / det, (a * gn - en * ge) / det
-            tried = _place_equations(rows, east + step_e, north + step_n, range_m, azimuth_rad, pose_xy_m, sigma, bias)
+            tried = _place_equations(
+                rows, east + step_e, north + step_n, range_m, azimuth_rad, pose_xy_m, sigma, bias[t]
+            )
             if tried[5] <= square:
                 east, north, damping = east + step_e, north + step_n, damping / 10
                 ee, en, nn, ge, gn, square = tried
@@ -106,7 +113,7 @@ def normal_equations(  # noqa: PLR0917 - numba takes no keyword-only arguments
     bias: Floats,
     place: Floats,
 ) -> tuple[Floats, Floats, Floats]:
-    """Return HᵀWH over place and bias, HᵀWε and εᵀWε of each track at its place."""
+    """Return HᵀWH over place and bias, HᵀWε and εᵀWε of each track at its place, `bias` being (n_tracks, 2)."""
     n_tracks = len(start) - 1
     matrix, gradient, square = np.zeros((n_tracks, 4, 4)), np.zeros((n_tracks, 4)), np.zeros(n_tracks)
     row = np.empty((2, 4))
@@ -116,7 +123,7 @@ def normal_equations(  # noqa: PLR0917 - numba takes no keyword-only arguments
             distance, angle, ux, uy = expected(place[t, 0], place[t, 1], pose_xy_m[i])
             row[0, 0], row[0, 1], row[0, 2], row[0, 3] = ux, uy, 1.0, 0.0
             row[1, 0], row[1, 1], row[1, 2], row[1, 3] = -uy / distance, ux / distance, 0.0, 1.0
-            error = (range_m[i] - bias[0] - distance, wrapped(azimuth_rad[i] - bias[1] - angle))
+            error = (range_m[i] - bias[t, 0] - distance, wrapped(azimuth_rad[i] - bias[t, 1] - angle))
             for axis in range(2):
                 weight = 1.0 / sigma[axis] ** 2
                 square[t] += weight * error[axis] ** 2

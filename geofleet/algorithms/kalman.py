@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from geofleet.algorithms.fragments import join_fragments
 from geofleet.algorithms.information import PassBias, TrackRows, information_form, pass_bias
-from geofleet.algorithms.kalman_kernels import Filter, associate_filtered
+from geofleet.algorithms.kalman_kernels import Filter, associate_filtered_passes
 from geofleet.algorithms.tracking_kernels import majority
 
 if TYPE_CHECKING:
@@ -40,13 +40,14 @@ BIAS_INFLATION = 4.0
 
 
 def track_kalman(seen: FrameDetections, reported: Poses, model: TrackerModel) -> Ints:
-    """Return the track of every detection, numbered by birth; ghosts are tracks of their own.
+    """Return the track of every detection, numbered by birth, pass after pass; ghosts are tracks of their own.
 
     Costs are linear in frames and detections, and in pairs of tracks that lie within `MERGE_RADIUS_M`.
     """
     if not len(seen.frame):
         return np.empty(0, dtype=np.int64)
-    unknown = PassBias(np.zeros(2), model.noise.bias_cov)
+    n_passes = len(seen.pass_start) - 1
+    unknown = PassBias(np.zeros((n_passes, 2)), np.tile(model.noise.bias_cov, (n_passes, 1, 1)))
     known = pass_bias(seen, reported, TrackRows.of(_forward(seen, reported, model, unknown)), model.noise)
     track = _forward(seen, reported, model, PassBias(known.mean, BIAS_INFLATION * known.cov))
     return _merged(seen, reported, model, track)
@@ -56,16 +57,17 @@ def _forward(seen: FrameDetections, reported: Poses, model: TrackerModel, bias: 
     assumed = Filter(
         model.noise.range_sigma_m**2,
         model.noise.bearing_sigma_rad**2,
-        bias.mean,
-        bias.cov,
+        bias.mean[0],
+        bias.cov[0],
         model.track_gate_chi2,
         model.class_error_rate,
-        int(seen.class_code.max()) + 1,
+        0,
         model.max_missed_frames,
     )
     frame_start = np.searchsorted(seen.frame, np.arange(seen.n_frames + 1))
-    track: Ints = associate_filtered(
-        frame_start, seen.range_m, seen.azimuth_rad, seen.class_code, reported.xy_m, assumed
+    track: Ints = associate_filtered_passes(
+        *(seen.pass_start, frame_start, seen.range_m, seen.azimuth_rad, seen.class_code, reported.xy_m),
+        *(bias.mean, bias.cov, assumed),
     )
     return track
 
@@ -76,9 +78,10 @@ def _merged(seen: FrameDetections, reported: Poses, model: TrackerModel, track: 
     bias = pass_bias(seen, reported, rows, model.noise)
     form = information_form(seen, reported, rows, model.noise, bias.mean)
     class_code, _ = majority(track, seen.class_code, len(form.s0))
-    pairs = cKDTree(form.origin_xy_m).query_pairs(MERGE_RADIUS_M, output_type="ndarray")
+    apart = np.column_stack((form.origin_xy_m, 2 * MERGE_RADIUS_M * rows.pass_of(seen)))  # passes never meet
+    pairs = cKDTree(apart).query_pairs(MERGE_RADIUS_M, output_type="ndarray")
     pairs = pairs[class_code[pairs[:, 0]] == class_code[pairs[:, 1]]]
-    chi2 = _disagreement(form, bias, *pairs.T)
+    chi2 = _disagreement(form, bias.cov[rows.pass_of(seen)[pairs[:, 0]]], *pairs.T)
     agreed = np.flatnonzero(chi2 < model.merge_gate_chi2)
     best_first = pairs[agreed[np.lexsort((pairs[agreed, 1], pairs[agreed, 0], chi2[agreed]))]]
     group = join_fragments(rows.start, rows.order, seen.frame, best_first[:, 0], best_first[:, 1], seen.n_frames)
@@ -86,12 +89,15 @@ def _merged(seen: FrameDetections, reported: Poses, model: TrackerModel, track: 
     return merged
 
 
-def _disagreement(form: Information, bias: PassBias, first: Ints, second: Ints) -> Floats:
-    """Return the χ² of the distance between two places, 2 degrees of freedom, what they share in bias taken out."""
+def _disagreement(form: Information, bias_cov: Floats, first: Ints, second: Ints) -> Floats:
+    """Return the χ² of the distance between two places, 2 degrees of freedom, what they share in bias taken out.
+
+    `bias_cov` is that of the pass of each pair, (n_pairs, 2, 2).
+    """
     cov = np.linalg.inv(form.matrix[:, :2, :2])
     by_bias = cov @ form.matrix[:, :2, 2:]  # a place moves by minus this times the bias
     apart = form.origin_xy_m[first] - form.origin_xy_m[second]
     lever = by_bias[first] - by_bias[second]
-    spread = cov[first] + cov[second] + lever @ bias.cov @ np.swapaxes(lever, 1, 2) + JITTER_M**2 * np.eye(2)
+    spread = cov[first] + cov[second] + lever @ bias_cov @ np.swapaxes(lever, 1, 2) + JITTER_M**2 * np.eye(2)
     chi2: Floats = np.einsum("ki,ki->k", apart, np.linalg.solve(spread, apart[:, :, None])[:, :, 0])
     return chi2

@@ -92,6 +92,50 @@ def associate_filtered(  # noqa: PLR0917 - numba takes no keyword-only arguments
 
 
 @njit(cache=True, nogil=True)
+def associate_filtered_passes(  # noqa: PLR0917 - numba takes no keyword-only arguments
+    pass_start: Ints,
+    frame_start: Ints,
+    range_m: Floats,
+    azimuth_rad: Floats,
+    class_code: Ints,
+    pose_xy_m: Floats,
+    bias: Floats,
+    bias_cov: Floats,
+    model: Filter,
+) -> Ints:
+    """Associate each pass by itself under its bias, (n_passes, 2), and classes as many as it reports.
+
+    The tracks of a pass are numbered after those of the passes before.
+    """
+    track, n_tracks = np.empty(len(range_m), np.int64), 0
+    for number in range(len(pass_start) - 1):
+        begin, end = pass_start[number], pass_start[number + 1]
+        first, last = frame_start[begin], frame_start[end]
+        if first == last:
+            continue
+        own = Filter(
+            model.range_var_m2,
+            model.bearing_var_rad2,
+            bias[number],
+            bias_cov[number],
+            model.gate_chi2,
+            model.class_error_rate,
+            class_code[first:last].max() + 1,
+            model.max_missed_frames,
+        )
+        track[first:last] = n_tracks + associate_filtered(
+            frame_start[begin : end + 1] - first,
+            range_m[first:last],
+            azimuth_rad[first:last],
+            class_code[first:last],
+            pose_xy_m[begin:end],
+            own,
+        )
+        n_tracks = track[first:last].max() + 1
+    return track
+
+
+@njit(cache=True, nogil=True)
 def _candidates(  # noqa: PLR0917 - numba takes no keyword-only arguments
     live: Ints,
     mean: Floats,

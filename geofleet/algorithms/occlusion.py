@@ -11,12 +11,14 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
+    from geofleet.algorithms.streams import PassesRandom
+
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
     Flags = NDArray[np.bool_]
 
 
-def occluded(frame: Ints, sign: Ints, *, share: float, mean_frames: float, rng: Generator) -> Flags:
+def occluded(frame: Ints, sign: Ints, *, share: float, mean_frames: float, rng: Generator | PassesRandom) -> Flags:
     """Draw which sightings of a pass are hidden.
 
     Each sign has a Markov chain of its own over the frames, stationary from its first frame: hidden for a share of the

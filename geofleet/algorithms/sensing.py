@@ -1,34 +1,34 @@
 """What a camera reports frame by frame: the paper's "Detection Simulation", one function an equation.
 
 The chain of a pass is `in_view_of` → `keep_detected` → `measured` → `recognised`, with `ghosts` beside it and
-`projected` at the end; `sense_pass` runs it. Positions are metres in an ENU frame, headings and bearings
+`projected` at the end; `sensing_chain` runs it. Positions are metres in an ENU frame, headings and bearings
 counter-clockwise (a bearing is positive to the left), angles of the model in degrees as in the configuration.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geofleet.algorithms.confusion import read_classes
-from geofleet.algorithms.occlusion import occluded
 from geofleet.algorithms.pose_errors import gauss_markov, wrong_fixes
 from geofleet.algorithms.sensing_kernels import in_view
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from geofleet.algorithms.billboards import Billboards
     from geofleet.algorithms.sensor_model import SensorModel
-    from geofleet.algorithms.streams import PassStreams
+    from geofleet.algorithms.streams import PassesRandom
     from geofleet.algorithms.trajectory import Poses
 
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
     Flags = NDArray[np.bool_]
+    Random = Generator | PassesRandom
 
 GHOST = -1
 """Stands for the sign of a detection that came from none."""
@@ -91,6 +91,16 @@ class Sightings:
         """Return some rows, by number or by flag."""
         return Sightings(self.frame[rows], self.sign[rows], self.range_m[rows], self.bearing_rad[rows])
 
+    @classmethod
+    def joined(cls, parts: Sequence[Sightings], first_frame: Sequence[int]) -> Sightings:
+        """Return one after the other, the frames of each counted from a first one."""
+        return cls(
+            np.concatenate([part.frame + first for part, first in zip(parts, first_frame, strict=True)]),
+            np.concatenate([part.sign for part in parts]),
+            np.concatenate([part.range_m for part in parts]),
+            np.concatenate([part.bearing_rad for part in parts]),
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
@@ -111,8 +121,32 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True)
+class FrameBiases:
+    """Sensor-setting errors of several passes: range bias (m) and bearing bias (rad), each (n_frames,)."""
+
+    range_bias_m: Floats
+    bearing_bias_rad: Floats
+
+    @classmethod
+    def of(cls, calibrations: Sequence[Calibration], pass_start: Ints) -> FrameBiases:
+        """Spread the calibration of each pass over its frames, `pass_start[k]:pass_start[k + 1]`."""
+        n_frames = np.diff(pass_start)
+        range_bias_m = np.repeat([one.range_bias_m for one in calibrations], n_frames)
+        bearing_bias_rad = np.repeat([one.bearing_bias_rad for one in calibrations], n_frames)
+        for one, first, last in zip(calibrations, pass_start[:-1], pass_start[1:], strict=True):
+            if one.drift is not None:
+                range_bias_m[first:last] += one.drift[:, 0]
+                bearing_bias_rad[first:last] += one.drift[:, 1]
+        return cls(range_bias_m, bearing_bias_rad)
+
+    def at(self, frame: Ints) -> tuple[Floats, Floats]:
+        """Return the range bias (m) and the bearing bias (rad) in some frames."""
+        return self.range_bias_m[frame], self.bearing_bias_rad[frame]
+
+
+@dataclass(frozen=True, slots=True)
 class FrameDetections:
-    """What a pass detects, one row a frame and object, by frame.
+    """What a pass detects, or several passes one after the other: one row a frame and object, by frame.
 
     Parameters
     ----------
@@ -123,7 +157,9 @@ class FrameDetections:
     range_m, azimuth_rad
         Measured range, and reported direction of view counter-clockwise from east, shape (n,).
     n_frames
-        Frames of the pass, with and without detections.
+        Frames of all passes, with and without detections.
+    later_passes
+        First frame of every pass but the first, shape (n_passes - 1,).
     """
 
     frame: Ints
@@ -133,11 +169,21 @@ class FrameDetections:
     range_m: Floats
     azimuth_rad: Floats
     n_frames: int
+    later_passes: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+
+    @property
+    def pass_start(self) -> Ints:
+        """First frame of each pass and, last, the number of all, shape (n_passes + 1,)."""
+        return np.concatenate(([0], self.later_passes, [self.n_frames]))
+
+    def pass_of(self, frame: Ints) -> Ints:
+        """Return the number of the pass that some frames belong to."""
+        return np.searchsorted(self.later_passes, frame, side="right")
 
 
 @dataclass(frozen=True, slots=True)
 class PassSensing:
-    """What a pass sees: the signs truly in view, what it detects, and where it says it was."""
+    """What one pass sees, or several: the signs truly in view, what is detected, and where they say they were."""
 
     in_view: Sightings
     detections: FrameDetections
@@ -227,12 +273,12 @@ def miss_rate(range_m: Floats, model: SensorModel) -> Floats | float:
     return missed
 
 
-def keep_detected(n: int, false_negative_rate: Floats | float, rng: Generator) -> Flags:
+def keep_detected(n: int, false_negative_rate: Floats | float, rng: Random) -> Flags:
     """Draw which of n signs in view are detected: each is missed with probability FN, independently."""
     return rng.random(n) >= false_negative_rate
 
 
-def measured(true: Sightings, calibration: Calibration, model: SensorModel, rng: Generator) -> Sightings:
+def measured(true: Sightings, calibration: Calibration | FrameBiases, model: SensorModel, rng: Random) -> Sightings:
     """Add both levels of error: d + ε_sensor + ε_object, and the same for θ (paper, eqs. 3-5).
 
     A range may come out negative when sigma is as large as the distance; the paper does not cut it, nor do we.
@@ -245,7 +291,7 @@ def measured(true: Sightings, calibration: Calibration, model: SensorModel, rng:
     return Sightings(true.frame, true.sign, range_m, bearing_rad)
 
 
-def recognised(true_class: Ints, *, n_classes: int, semantic_rate: float, rng: Generator) -> Ints:
+def recognised(true_class: Ints, *, n_classes: int, semantic_rate: float, rng: Random) -> Ints:
     """Recognise classes (paper, Algorithm 1): keep with probability r_semantic, else a random other valid class.
 
     Raises
@@ -263,10 +309,13 @@ def recognised(true_class: Ints, *, n_classes: int, semantic_rate: float, rng: G
     return np.where(correct, true_class, other)
 
 
-def ghosts(n_frames: int, *, n_classes: int, model: SensorModel, rng: Generator) -> tuple[Sightings, Ints]:
-    """Draw false positives: N ~ Poisson(λ) a frame, uniform over the view cone, with a random valid class each."""
-    count = rng.poisson(model.ghosts_per_frame, n_frames)
-    frame = np.repeat(np.arange(n_frames), count)
+def ghost_frames(n_frames: int, model: SensorModel, rng: Random) -> Ints:
+    """Draw how many false positives each frame has, N ~ Poisson(λ), and return the frame of every one."""
+    return np.repeat(np.arange(n_frames), rng.poisson(model.ghosts_per_frame, n_frames))
+
+
+def ghosts(frame: Ints, *, n_classes: int, model: SensorModel, rng: Random) -> tuple[Sightings, Ints]:
+    """Draw the false positives of some frames: uniform over the view cone, with a random valid class each."""
     n = len(frame)
     range_m = model.range_m * np.sqrt(rng.random(n))  # area grows with the square of the radius
     bearing_rad = model.half_fov_rad * (2 * rng.random(n) - 1)
@@ -294,7 +343,9 @@ def ghost_tracks(
     place = true.xy_m[born] + range_m[:, None] * np.column_stack((np.cos(azimuth_rad), np.sin(azimuth_rad)))
     visible = in_view_of(true, SignField(place, class_code, n_classes=n_classes, cell_m=model.range_m), model)
     there = (visible.frame >= born[visible.sign]) & (visible.frame <= last[visible.sign])
-    seen = _detected(visible.take(there), calibration, model, rng, None)
+    near = visible.take(there)
+    kept = keep_detected(len(near.frame), miss_rate(near.range_m, model), rng)
+    seen = measured(near.take(kept), calibration, model, rng)
     return Sightings(seen.frame, first - seen.sign, seen.range_m, seen.bearing_rad), class_code[seen.sign]
 
 
@@ -303,82 +354,3 @@ def projected(seen: Sightings, reported: Poses) -> tuple[Floats, Floats]:
     azimuth_rad = reported.heading_rad[seen.frame] + seen.bearing_rad
     ray = np.column_stack((np.cos(azimuth_rad), np.sin(azimuth_rad)))
     return reported.xy_m[seen.frame] + seen.range_m[:, None] * ray, azimuth_rad
-
-
-def sense_pass(
-    true: Poses, signs: SignField, model: SensorModel, streams: PassStreams, billboards: Billboards | None = None
-) -> PassSensing:
-    """Simulate what one pass over true poses detects, frame by frame.
-
-    Signs and billboards that are hidden are in view: they could have been seen, had nothing stood before them.
-    """
-    n_frames = len(true.heading_rad)
-    visible = in_view_of(true, signs, model)
-    reported = reported_poses(true, model, streams.pose, None if model.is_steady else streams.drift)
-    calibration = draw_calibration(model, streams.calibration)
-    if model.has_bias_drift:
-        calibration = drifting(calibration, true, model, streams.bias_drift)
-    seen = _detected(visible, calibration, model, streams.frames, streams.occlusion if model.occluded_share else None)
-    class_code = _classes_seen(seen, signs, model, streams.classes)
-    if billboards is not None and len(billboards.share):
-        seen, class_code = _merged(seen, class_code, *_billboards_seen(true, billboards, calibration, model, streams))
-    if model.ghost_tracks_per_km > 0:
-        first = FIRST_BILLBOARD - (0 if billboards is None else len(billboards.share))
-        phantoms = ghost_tracks(true, signs.n_classes, calibration, model, streams.ghost_tracks, first=first)
-        seen, class_code = _merged(seen, class_code, *phantoms)
-    ghost, ghost_class = ghosts(n_frames, n_classes=signs.n_classes, model=model, rng=streams.ghosts)
-    if len(ghost_class):
-        seen, class_code = _merged(seen, class_code, ghost, ghost_class)
-    xy_m, azimuth_rad = projected(seen, reported)
-    detections = FrameDetections(seen.frame, seen.sign, class_code, xy_m, seen.range_m, azimuth_rad, n_frames)
-    return PassSensing(visible, detections, reported)
-
-
-def _detected(
-    visible: Sightings, calibration: Calibration, model: SensorModel, frames: Generator, occlusion: Generator | None
-) -> Sightings:
-    """Return what is measured of the signs in view that are neither missed nor hidden."""
-    kept = keep_detected(len(visible.frame), miss_rate(visible.range_m, model), frames)
-    if occlusion is not None and model.occluded_share > 0:
-        share, mean_frames = model.occluded_share, model.occlusion_frames
-        kept &= ~occluded(visible.frame, visible.sign, share=share, mean_frames=mean_frames, rng=occlusion)
-    return measured(visible.take(kept), calibration, model, frames)
-
-
-def _billboards_seen(
-    true: Poses, billboards: Billboards, calibration: Calibration, model: SensorModel, streams: PassStreams
-) -> tuple[Sightings, Ints]:
-    """Return what is measured of the billboards that this pass takes for signs, and their classes."""
-    taken = billboards.reported(streams.billboards)
-    if not len(taken):
-        return Sightings(taken, taken, np.empty(0), np.empty(0)), taken
-    field = SignField(billboards.xy_m[taken], taken, n_classes=1, cell_m=model.range_m)
-    visible = in_view_of(true, field, model)
-    seen = _detected(visible, calibration, model, streams.billboards, streams.billboards)
-    number = taken[seen.sign]
-    return Sightings(seen.frame, FIRST_BILLBOARD - number, seen.range_m, seen.bearing_rad), billboards.class_code[
-        number
-    ]
-
-
-def _classes_seen(seen: Sightings, signs: SignField, model: SensorModel, rng: Generator) -> Ints:
-    """Return the reported class of each row, drawn once a sign and pass or for every frame."""
-    per_frame = model.semantic_draw == "frame"
-    true_class = signs.class_code[seen.sign] if per_frame else signs.class_code
-    if model.confusion is None:
-        drawn = recognised(true_class, n_classes=signs.n_classes, semantic_rate=model.semantic_rate, rng=rng)
-    else:
-        drawn = read_classes(true_class, model.confusion, rng)
-    return drawn if per_frame else drawn[seen.sign]
-
-
-def _merged(seen: Sightings, class_code: Ints, ghost: Sightings, ghost_class: Ints) -> tuple[Sightings, Ints]:
-    """Return signs and ghosts together, by frame, signs first within a frame."""
-    order = np.argsort(np.concatenate((seen.frame, ghost.frame)), kind="stable")
-    both = Sightings(
-        np.concatenate((seen.frame, ghost.frame)),
-        np.concatenate((seen.sign, ghost.sign)),
-        np.concatenate((seen.range_m, ghost.range_m)),
-        np.concatenate((seen.bearing_rad, ghost.bearing_rad)),
-    )
-    return both.take(order), np.concatenate((class_code, ghost_class))[order]

@@ -101,3 +101,16 @@ def _n_candidates(  # noqa: PLR0917 - numba takes no keyword-only arguments
             if columns[0] < columns[1]:
                 n += cell_start[row * shape[1] + columns[1]] - cell_start[row * shape[1] + columns[0]]
     return n
+
+
+@njit(cache=True, nogil=True)
+def by_frame(first: Ints, second: Ints) -> Ints:
+    """Return the order that merges two runs of rows by frame, numbered through both; of equals, `first` comes first."""
+    order = np.empty(len(first) + len(second), np.int64)
+    i, j = 0, 0
+    for k in range(len(order)):
+        if j == len(second) or (i < len(first) and first[i] <= second[j]):
+            order[k], i = i, i + 1
+        else:
+            order[k], j = len(first) + j, j + 1
+    return order

@@ -14,7 +14,12 @@ import numpy as np
 from numpy.random import Generator, SeedSequence
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
 
 _CALIBRATION, _POSE, _FRAMES, _CLASSES, _GHOSTS, _CHOICE, _DRIFT, _OCCLUSION, _BILLBOARDS = range(9)
 _POOL, _WORD = 4, 0xFFFFFFFF
@@ -113,6 +118,51 @@ def pass_streams(seed: int, *, replicate: int, vehicle: int, pass_number: int = 
 def world_stream(seed: int, *, replicate: int) -> Generator:
     """Return a fresh generator of what all vehicles of a run meet alike: where the billboards stand."""
     return _generator(seed, (replicate,), _BILLBOARDS)
+
+
+class PassesRandom:
+    """Generators of several passes, drawn from as if they were one: each fills the places that are its pass's.
+
+    What is drawn for a pass does not depend on the passes that it is drawn with.
+
+    Parameters
+    ----------
+    generators
+        One a pass.
+    start
+        Where the places of each pass begin and, last, where they end, shape (n_passes + 1,).
+    """
+
+    def __init__(self, generators: Sequence[Generator], start: Ints) -> None:
+        self._draws = list(zip(generators, start[:-1].tolist(), start[1:].tolist(), strict=True))
+
+    def random(self, n: int) -> Floats:
+        """Draw uniform numbers, 0 … below 1, as `Generator.random`."""
+        out = np.empty(n)
+        for generator, first, last in self._draws:
+            generator.random(out=out[first:last])
+        return out
+
+    def standard_normal(self, n: int) -> Floats:
+        """Draw standard normal numbers, as `Generator.standard_normal`."""
+        out = np.empty(n)
+        for generator, first, last in self._draws:
+            generator.standard_normal(out=out[first:last])
+        return out
+
+    def integers(self, low: int, high: int, n: int) -> Ints:
+        """Draw whole numbers, `low` … below `high`, as `Generator.integers`."""
+        out = np.empty(n, dtype=np.int64)
+        for generator, first, last in self._draws:
+            out[first:last] = generator.integers(low, high, last - first)
+        return out
+
+    def poisson(self, mean: float, n: int) -> Ints:
+        """Draw Poisson numbers, as `Generator.poisson`."""
+        out = np.empty(n, dtype=np.int64)
+        for generator, first, last in self._draws:
+            out[first:last] = generator.poisson(mean, last - first)
+        return out
 
 
 def _generator(seed: int, whose: tuple[int, ...], purpose: int) -> Generator:

@@ -15,9 +15,12 @@ import numpy as np
 from geofleet.algorithms.information import Information, PolarNoise, TrackRows, information_form, pass_bias
 from geofleet.algorithms.kalman import track_kalman
 from geofleet.algorithms.sensing import GHOST
-from geofleet.algorithms.tracking_kernels import associate, majority, moments, spans
+from geofleet.algorithms.streams import PassesRandom
+from geofleet.algorithms.tracking_kernels import associate_passes, majority, moments, spans
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.random import Generator
     from numpy.typing import NDArray
 
@@ -80,7 +83,7 @@ class TrackerModel:
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """What a pass sends, one row a track in the order of birth, and (`sign`) where it came from.
+    """What passes send, one row a track in the order of birth, pass after pass, and (`sign`) where it came from.
 
     Parameters
     ----------
@@ -88,8 +91,10 @@ class Tracks:
         Mean position, shape (n, 2).
     sigma_e_m, sigma_n_m, cov_en_m2
         Spread over frames with F - 1 in the denominator; NaN when F = 1.
+    pass_number
+        Of which pass, counted from 0.
     n_frames, frame_first, frame_last
-        F, and the frames of the first and the last detection.
+        F, and the frames of the first and the last detection, counted from the first of the pass.
     range_mean_m, azimuth_rad
         Mean measured range, and mean direction of view.
     class_code, class_confidence
@@ -104,6 +109,7 @@ class Tracks:
     sigma_e_m: Floats
     sigma_n_m: Floats
     cov_en_m2: Floats
+    pass_number: Ints
     n_frames: Ints
     frame_first: Ints
     frame_last: Ints
@@ -118,9 +124,16 @@ class Tracks:
 def track_pass(
     seen: FrameDetections, reported: Poses, model: TrackerModel, streams: PassStreams | None = None
 ) -> Tracks:
-    """Track the detections of a pass and return what is sent: tracks of at least `min_track_frames` frames.
+    """Track the detections of one pass and return what is sent: `track_passes` of one."""
+    return track_passes(seen, reported, model, None if streams is None else [streams])
 
-    `streams` are needed to split tracks, which is the one thing here that is random.
+
+def track_passes(
+    seen: FrameDetections, reported: Poses, model: TrackerModel, streams: Sequence[PassStreams] | None = None
+) -> Tracks:
+    """Track the detections of passes, each by itself, and return what is sent: tracks of `min_track_frames` or more.
+
+    `streams`, one a pass, are needed to split tracks, which is the one thing here that is random.
     """
     if model.tracker == "ideal":
         track = track_ideal(seen)
@@ -131,9 +144,9 @@ def track_pass(
     if model.split_track_rate > 0:
         if streams is None:
             raise ValueError("to split tracks takes random numbers: give the streams of the pass")
-        track = split_tracks(
-            track, rate=model.split_track_rate, min_track_frames=model.min_track_frames, rng=streams.splits
-        )
+        track_start = np.searchsorted(TrackRows.of(track).pass_of(seen), np.arange(len(streams) + 1))
+        rng = PassesRandom([own.splits for own in streams], track_start)
+        track = split_tracks(track, rate=model.split_track_rate, min_track_frames=model.min_track_frames, rng=rng)
     tracks = summarise(seen, track, min_track_frames=model.min_track_frames)
     if not model.send_information:
         return tracks
@@ -148,13 +161,14 @@ def _information(seen: FrameDetections, reported: Poses, track: Ints, model: Tra
 
 
 def track_paper(seen: FrameDetections, reported: Poses, model: TrackerModel) -> Ints:
-    """Return the track of every detection by frame-to-frame association, numbered by birth.
+    """Return the track of every detection by frame-to-frame association, numbered by birth, pass after pass.
 
     In each frame, detections and live tracks are assigned one to one so that as many pairs as possible are nearer
     than the gate and, of those assignments, the total ENU distance is least: the Hungarian algorithm, exactly.
     """
     frame_start = np.searchsorted(seen.frame, np.arange(seen.n_frames + 1))
-    track: Ints = associate(
+    track: Ints = associate_passes(
+        seen.pass_start,
         frame_start,
         seen.xy_m,
         reported.xy_m,
@@ -171,18 +185,20 @@ def track_paper(seen: FrameDetections, reported: Poses, model: TrackerModel) -> 
 
 def track_ideal(seen: FrameDetections) -> Ints:
     """Return the track of every detection with identities known: one a sign, one a ghost, numbered by birth."""
-    fresh = seen.sign.max(initial=0) + 1 + np.arange(len(seen.sign))
-    return _by_birth(np.where(seen.sign == GHOST, fresh, seen.sign))
+    n = len(seen.sign)
+    low, high = int(seen.sign.min(initial=0)), int(seen.sign.max(initial=0))
+    of_pass = seen.sign + (high - low + 1) * seen.pass_of(seen.frame)
+    return _by_birth(np.where(seen.sign == GHOST, of_pass.max(initial=0) + 1 + np.arange(n), of_pass))
 
 
-def split_tracks(track: Ints, *, rate: float, min_track_frames: int, rng: Generator) -> Ints:
+def split_tracks(track: Ints, *, rate: float, min_track_frames: int, rng: Generator | PassesRandom) -> Ints:
     """Cut a share of the tracks in two and return the track of every detection, numbered by birth.
 
     A track of 2 `min_track_frames` detections or more is cut with probability `rate`, at any detection that leaves both
     parts long enough to be sent, alike.
     """
     count = np.bincount(track)
-    chance, where = rng.random((2, len(count)))
+    chance, where = rng.random(len(count)), rng.random(len(count))
     is_cut = (chance < rate) & (count >= 2 * min_track_frames)
     cut = np.where(is_cut, min_track_frames + (where * (count - 2 * min_track_frames + 1)).astype(np.int64), count)
     order = np.argsort(track, kind="stable")
@@ -210,6 +226,8 @@ def summarise(seen: FrameDetections, track: Ints, *, min_track_frames: int) -> T
     first, last = spans(track, seen.frame, n_tracks)
     ray_x = np.bincount(track, np.cos(seen.azimuth_rad), n_tracks)
     ray_y = np.bincount(track, np.sin(seen.azimuth_rad), n_tracks)
+    pass_number = seen.pass_of(first)
+    first_frame = seen.pass_start[pass_number]
     freedom = np.where(count > 1, count - 1.0, np.nan)[:, None]
     var_e, var_n, cov_en = (scatter / freedom)[sent].T
     return Tracks(
@@ -217,9 +235,10 @@ def summarise(seen: FrameDetections, track: Ints, *, min_track_frames: int) -> T
         sigma_e_m=np.sqrt(var_e),
         sigma_n_m=np.sqrt(var_n),
         cov_en_m2=cov_en,
+        pass_number=pass_number[sent],
         n_frames=count[sent],
-        frame_first=first[sent],
-        frame_last=last[sent],
+        frame_first=(first - first_frame)[sent],
+        frame_last=(last - first_frame)[sent],
         range_mean_m=(np.bincount(track, seen.range_m, n_tracks) / count)[sent],
         azimuth_rad=np.arctan2(ray_y, ray_x)[sent],
         class_code=class_code[sent],

@@ -188,6 +188,42 @@ def associate(  # noqa: PLR0917 - numba takes no keyword-only arguments
 
 
 @njit(cache=True, nogil=True)
+def associate_passes(  # noqa: PLR0917 - numba takes no keyword-only arguments
+    pass_start: Ints,
+    frame_start: Ints,
+    xy_m: Floats,
+    pose_xy_m: Floats,
+    heading_rad: Floats,
+    gate_m: float,
+    max_missed_frames: int,
+    use_mean: bool,  # noqa: FBT001
+    end_on_leaving_view: bool,  # noqa: FBT001
+    range_m: float,
+    half_fov_rad: float,
+) -> Ints:
+    """Associate each pass by itself; the tracks of a pass are numbered after those of the passes before."""
+    track, n_tracks = np.empty(len(xy_m), dtype=np.int64), 0
+    for number in range(len(pass_start) - 1):
+        begin, end = pass_start[number], pass_start[number + 1]
+        first, last = frame_start[begin], frame_start[end]
+        track[first:last] = n_tracks + associate(
+            frame_start[begin : end + 1] - first,
+            xy_m[first:last],
+            pose_xy_m[begin:end],
+            heading_rad[begin:end],
+            gate_m,
+            max_missed_frames,
+            use_mean,
+            end_on_leaving_view,
+            range_m,
+            half_fov_rad,
+        )
+        for i in range(first, last):
+            n_tracks = max(n_tracks, track[i] + 1)
+    return track
+
+
+@njit(cache=True, nogil=True)
 def _without_stale(live: Ints, n_live: int, last_frame: Ints, oldest: int) -> int:
     """Drop from `live` the tracks last seen before frame `oldest`; return how many are left."""
     kept = 0

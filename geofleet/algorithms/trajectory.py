@@ -14,6 +14,8 @@ from numba import njit
 from geofleet.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.random import Generator
     from numpy.typing import NDArray
 
@@ -46,6 +48,17 @@ class Poses:
     heading_rad: Floats
     along_m: Floats
     elapsed_s: Floats | None = None
+
+    @classmethod
+    def joined(cls, poses: Sequence[Poses]) -> Poses:
+        """Return the poses of several passes, one after the other; times only when all have them."""
+        elapsed_s = [one.elapsed_s for one in poses if one.elapsed_s is not None]
+        return cls(
+            np.concatenate([one.xy_m for one in poses]),
+            np.concatenate([one.heading_rad for one in poses]),
+            np.concatenate([one.along_m for one in poses]),
+            np.concatenate(elapsed_s) if len(elapsed_s) == len(poses) else None,
+        )
 
 
 @dataclass(frozen=True, slots=True)

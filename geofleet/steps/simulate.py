@@ -18,9 +18,9 @@ from zlib import crc32
 import numpy as np
 import pyarrow as pa
 
-from geofleet.algorithms.sensing import sense_pass
+from geofleet.algorithms.sensing_chain import sense_passes
 from geofleet.algorithms.streams import pass_streams
-from geofleet.algorithms.tracking import track_pass
+from geofleet.algorithms.tracking import track_passes
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats.layers import read_layer
 from geofleet.tables.fleets import Fleet, load_fleet
@@ -28,7 +28,7 @@ from geofleet.tables.manifest import hash_path, write_manifest
 from geofleet.tables.schemas import DETECTIONS, PASSES, REFERENCE, RUNS, TRUTH
 from geofleet.tables.simulated import (
     PassIds,
-    SimulatedPass,
+    SimulatedPasses,
     detections_table,
     passes_table,
     reference_table,
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from geofleet.algorithms.billboards import Billboards
     from geofleet.algorithms.sensing import PassSensing
     from geofleet.config import Config
+    from geofleet.tables.fleets import Pass
     from geofleet.tables.schemas import Schema
 
     Ints = NDArray[np.int64]
@@ -265,12 +266,11 @@ def _parts(outputs: Iterator[_BatchOutput], tally: _Tally) -> Iterator[pa.Table]
 
 
 def _simulate_batch(fleet: Fleet, batch: _Batch) -> _BatchOutput:
-    """Simulate one pass a vehicle, in a row, and write their detections when each has a folder."""
+    """Simulate one pass a vehicle, and write their detections when each has a folder."""
     passes, in_view, n_frame_detections = [], np.zeros((2, len(fleet.scene.sign_ids)), dtype=np.int64), 0
-    for vehicle in batch.vehicles:
-        driven, sensed = _simulate_pass(fleet, batch.run, vehicle)
-        frames = np.bincount(sensed.in_view.sign, minlength=in_view.shape[1])
-        in_view += np.stack((frames > 0, frames))
+    for drives in _by_kind(fleet, batch):
+        driven, sensed = _simulate_passes(fleet, batch.run, drives)
+        in_view += _times_in_view(sensed, len(fleet.scene.sign_ids))
         n_frame_detections += len(sensed.detections.frame)
         passes.append(driven)
     table = detections_table(passes, fleet.scene.classes, fleet.frame)
@@ -287,33 +287,49 @@ def _simulate_batch(fleet: Fleet, batch: _Batch) -> _BatchOutput:
     )
 
 
-def _simulate_pass(fleet: Fleet, run: _Run, vehicle: int) -> tuple[SimulatedPass, PassSensing]:
-    """Drive, sense and track one pass."""
-    streams = pass_streams(run.seed, replicate=run.replicate, vehicle=vehicle)
-    drive = fleet.start(vehicle, streams)
-    sensed = sense_pass(drive.true, fleet.scene.field, drive.kind.sensor, streams, run.billboards)
-    settings = fleet.config.fleet
-    driven = SimulatedPass(
-        ids=PassIds.of(run.run_id, vehicle),
-        drive_id=drive.way.drive.drive_id,
-        sensor=drive.kind.config,
-        declared=drive.kind.declared,
-        frame_spacing_m=drive.frame_spacing_m if settings.frame_rate_hz else settings.frame_spacing_m,
+def _by_kind(fleet: Fleet, batch: _Batch) -> list[list[Pass]]:
+    """Let the vehicles of a batch drive; those with one kind of sensor are sensed together."""
+    groups: dict[int, list[Pass]] = {}
+    for vehicle in batch.vehicles:
+        streams = pass_streams(batch.run.seed, replicate=batch.run.replicate, vehicle=vehicle)
+        drive = fleet.start(vehicle, streams)
+        groups.setdefault(id(drive.kind), []).append(drive)
+    return list(groups.values())
+
+
+def _simulate_passes(fleet: Fleet, run: _Run, drives: list[Pass]) -> tuple[SimulatedPasses, PassSensing]:
+    """Sense and track passes with one kind of sensor."""
+    kind, streams, settings = drives[0].kind, [drive.streams for drive in drives], fleet.config.fleet
+    sensed = sense_passes([drive.true for drive in drives], fleet.scene.field, kind.sensor, streams, run.billboards)
+    passes = SimulatedPasses(
+        ids=[PassIds.of(run.run_id, drive.vehicle) for drive in drives],
+        drive_ids=[drive.way.drive.drive_id for drive in drives],
+        frame_spacing_m=[one.frame_spacing_m if settings.frame_rate_hz else settings.frame_spacing_m for one in drives],
+        sensor=kind.config,
+        declared=kind.declared,
+        pass_start=sensed.detections.pass_start,
         reported=sensed.reported,
-        times=drive.times,
-        tracks=track_pass(sensed.detections, sensed.reported, drive.kind.tracker, streams),
+        times=np.concatenate([drive.times for drive in drives]),
+        tracks=track_passes(sensed.detections, sensed.reported, kind.tracker, streams),
     )
-    return driven, sensed
+    return passes, sensed
 
 
-def _write_folders(detections: pa.Table, run: _Run, passes: list[SimulatedPass]) -> None:
+def _times_in_view(sensed: PassSensing, n_signs: int) -> Ints:
+    """Return how many passes and how many frames had each sign in view, shape (2, n_signs)."""
+    number, n_passes = sensed.detections.pass_of(sensed.in_view.frame), len(sensed.detections.pass_start) - 1
+    frames = np.bincount(sensed.in_view.sign + n_signs * number, minlength=n_signs * n_passes).reshape(-1, n_signs)
+    return np.stack(((frames > 0).sum(axis=0), frames.sum(axis=0)))
+
+
+def _write_folders(detections: pa.Table, run: _Run, passes: list[SimulatedPasses]) -> None:
     """Write the detections of each vehicle into a folder of its own; rows are sorted by pass."""
     plain, first = detections.drop_columns(list(DETECTIONS.partitions)), 0
-    for one in passes:
-        n_tracks = len(one.tracks.sign)
-        folder = _folder(run, "detections", f"vehicle_id={one.ids.vehicle_id}")
-        write_table(DETECTIONS, plain.slice(first, n_tracks), folder / "part-0.parquet")
-        first += n_tracks
+    n_tracks = {ids.vehicle_id: n for group in passes for ids, n in zip(group.ids, group.n_tracks, strict=True)}
+    for vehicle_id in sorted(n_tracks):
+        folder = _folder(run, "detections", f"vehicle_id={vehicle_id}")
+        write_table(DETECTIONS, plain.slice(first, n_tracks[vehicle_id]), folder / "part-0.parquet")
+        first += n_tracks[vehicle_id]
 
 
 def _write_buckets(detections: pa.Table, run: _Run, part: int) -> None:

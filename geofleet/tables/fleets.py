@@ -57,12 +57,17 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """One vehicle's run: the way, the kind of its sensor, its true poses and the time of every frame, when dated."""
+    """One vehicle's run: the way, the kind of its sensor, its true poses, and the time of every frame or NaT.
 
+    `streams` are the random numbers of what follows.
+    """
+
+    vehicle: int
+    streams: PassStreams
     way: Way
     kind: Kind
     true: Poses
-    times: NDArray[np.datetime64] | None
+    times: NDArray[np.datetime64]
 
     @property
     def frame_spacing_m(self) -> float:
@@ -119,7 +124,7 @@ class Fleet:
             rng=streams.pose,
         )
         true = _timed(true, way.line, fleet, streams.pose)
-        return Pass(way, kind, true, _frame_times(way.drive, true, vehicle * fleet.headway_s))
+        return Pass(vehicle, streams, way, kind, true, _frame_times(way.drive, true, vehicle * fleet.headway_s))
 
 
 def load_fleet(layer: pa.Table, drive: Path, *, source: Path, config: Config) -> Fleet:
@@ -242,10 +247,10 @@ def _timed(true: Poses, line: DriveLine, fleet: FleetConfig, rng: Generator) -> 
     return frames_in_time(true, line, times_s=times_s, rate_hz=fleet.frame_rate_hz)
 
 
-def _frame_times(drive: Drive, true: Poses, begin_s: float) -> NDArray[np.datetime64] | None:
-    """Return the time of every frame; without a dated drive there is none."""
+def _frame_times(drive: Drive, true: Poses, begin_s: float) -> NDArray[np.datetime64]:
+    """Return the time of every frame; without a dated drive there is none, NaT."""
     if drive.t_start is None or true.elapsed_s is None:
-        return None
+        return np.full(len(true.heading_rad), np.datetime64("NaT", "us"))
     microseconds = np.rint((begin_s + true.elapsed_s) * 1e6).astype("timedelta64[us]")
     times: NDArray[np.datetime64] = drive.t_start + microseconds
     return times

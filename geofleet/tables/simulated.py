@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     Times = NDArray[np.datetime64]
 
 _UPPER = np.triu_indices(4)
-_NEVER = np.datetime64("NaT", "us")
 _AS_SENT = (
     *("frame_first", "frame_last", "n_frames", "sigma_e_m", "sigma_n_m", "cov_en_m2"),
     *("range_mean_m", "class_confidence"),
@@ -53,33 +52,49 @@ class PassIds:
 
 
 @dataclass(frozen=True, slots=True)
-class SimulatedPass:
-    """What is kept of a pass: its names and sensor, the way that it believes it drove, and what it sends.
+class SimulatedPasses:
+    """What is kept of passes with one kind of sensor: the ways that they believe they drove, and what they send.
 
-    `times` is the time of every frame, `frame_spacing_m` the distance between two.
+    Parameters
+    ----------
+    ids, drive_ids, frame_spacing_m
+        Of each pass: its names, its drive, the distance between two frames.
+    pass_start
+        First frame of each pass and, last, the number of all, shape (n_passes + 1,).
+    reported, times
+        Of every frame of all passes, one after the other; without a dated drive a time is NaT.
+    tracks
+        Of all passes, one after the other.
     """
 
-    ids: PassIds
-    drive_id: str
+    ids: Sequence[PassIds]
+    drive_ids: Sequence[str]
+    frame_spacing_m: Sequence[float]
     sensor: SensorConfig
     declared: Declared
-    frame_spacing_m: float
+    pass_start: Ints
     reported: Poses
-    times: Times | None
+    times: Times
     tracks: Tracks
 
+    @property
+    def n_tracks(self) -> list[int]:
+        """How many tracks each pass sends."""
+        counts: list[int] = np.bincount(self.tracks.pass_number, minlength=len(self.ids)).tolist()
+        return counts
 
-def detections_table(passes: Sequence[SimulatedPass], classes: NDArray[np.object_], frame: EnuFrame) -> pa.Table:
+
+def detections_table(passes: Sequence[SimulatedPasses], classes: NDArray[np.object_], frame: EnuFrame) -> pa.Table:
     """Return what some passes of a run send; `classes` names the codes."""
     columns: dict[str, object] = {name: _of_tracks(passes, name) for name in _AS_SENT}
     columns |= _keys(passes) | {
-        "vehicle_id": _of_each(passes, [one.ids.vehicle_id for one in passes]),
+        "vehicle_id": _of_each(passes, "vehicle_id"),
         "t_first": _times(passes, "frame_first"),
         "t_last": _times(passes, "frame_last"),
         "view_deg": (90.0 - np.rad2deg(_of_tracks(passes, "azimuth_rad"))) % 360.0,
         "sign_class": _named(classes, _of_tracks(passes, "class_code")),
     }
-    forms = [one.tracks.information for one in passes if one.tracks.information is not None]
+    forms = [group.tracks.information for group in passes if group.tracks.information is not None]
     if forms:
         columns |= _information(forms, frame)
     return build_table(DETECTIONS, columns, geometry=frame.to_lonlat(_of_tracks(passes, "xy_m")))
@@ -99,37 +114,36 @@ def _information(forms: list[Information], frame: EnuFrame) -> dict[str, object]
     }
 
 
-def passes_table(passes: Sequence[SimulatedPass], frame: EnuFrame) -> pa.Table:
+def passes_table(passes: Sequence[SimulatedPasses], frame: EnuFrame) -> pa.Table:
     """Return a row a pass: the way that it believes it drove, what its sensor can see, and what it declares."""
-    lonlat_deg = np.column_stack(frame.to_lonlat(np.concatenate([one.reported.xy_m for one in passes])))
-    number = np.repeat(np.arange(len(passes)), [len(one.reported.xy_m) for one in passes])
     rows = [
         {
-            "pass_id": one.ids.pass_id,
-            "vehicle_id": one.ids.vehicle_id,
-            "sensor_id": f"{one.ids.vehicle_id}-s0",
-            "sensor_kind": one.sensor.sensor_kind,
-            "drive_id": one.drive_id,
-            "range_m": one.sensor.range_m,
-            "fov_deg": one.sensor.fov_deg,
-            "frame_spacing_m": one.frame_spacing_m,
-            **asdict(one.declared),
+            "pass_id": ids.pass_id,
+            "vehicle_id": ids.vehicle_id,
+            "sensor_id": f"{ids.vehicle_id}-s0",
+            "sensor_kind": group.sensor.sensor_kind,
+            "drive_id": drive_id,
+            "range_m": group.sensor.range_m,
+            "fov_deg": group.sensor.fov_deg,
+            "frame_spacing_m": frame_spacing_m,
+            **asdict(group.declared),
         }
-        for one in passes
+        for group in passes
+        for ids, drive_id, frame_spacing_m in zip(group.ids, group.drive_ids, group.frame_spacing_m, strict=True)
     ]
     columns: dict[str, object] = {name: [row[name] for row in rows] for name in rows[0]}
-    ends = {
-        name: np.array([_NEVER if one.times is None else one.times[at] for one in passes], _NEVER.dtype)
-        for name, at in (("t_start", 0), ("t_end", -1))
-    }
+    columns["t_start"] = np.concatenate([group.times[group.pass_start[:-1]] for group in passes])
+    columns["t_end"] = np.concatenate([group.times[group.pass_start[1:] - 1] for group in passes])
+    lonlat_deg = np.column_stack(frame.to_lonlat(np.concatenate([group.reported.xy_m for group in passes])))
+    n_frames = np.concatenate([np.diff(group.pass_start) for group in passes])
     return build_table(
         PASSES,
-        columns | ends | {"run_id": passes[0].ids.run_id},
-        geometry=shapely.linestrings(lonlat_deg, indices=number),
+        columns | {"run_id": passes[0].ids[0].run_id},
+        geometry=shapely.linestrings(lonlat_deg, indices=np.repeat(np.arange(len(rows)), n_frames)),
     )
 
 
-def truth_table(passes: Sequence[SimulatedPass], scene: Scene) -> pa.Table:
+def truth_table(passes: Sequence[SimulatedPasses], scene: Scene) -> pa.Table:
     """Return which sign each track of some passes came from; of none, or of a billboard: a ghost."""
     origin = _of_tracks(passes, "sign")
     is_ghost = origin < 0
@@ -144,23 +158,30 @@ def truth_table(passes: Sequence[SimulatedPass], scene: Scene) -> pa.Table:
     return build_table(TRUTH, _keys(passes) | columns)
 
 
-def _keys(passes: Sequence[SimulatedPass]) -> dict[str, object]:
+def _keys(passes: Sequence[SimulatedPasses]) -> dict[str, object]:
     return {
-        "run_id": passes[0].ids.run_id,
-        "pass_id": _of_each(passes, [one.ids.pass_id for one in passes]),
-        "track_id": np.concatenate([np.arange(len(one.tracks.sign)) for one in passes]),
+        "run_id": passes[0].ids[0].run_id,
+        "pass_id": _of_each(passes, "pass_id"),
+        "track_id": np.concatenate([_track_ids(group) for group in passes]),
     }
 
 
-def _of_tracks(passes: Sequence[SimulatedPass], name: str) -> NDArray[Any]:
+def _track_ids(group: SimulatedPasses) -> Ints:
+    """Count the tracks of each pass from 0."""
+    number = group.tracks.pass_number
+    ids: Ints = np.arange(len(number)) - np.searchsorted(number, number)
+    return ids
+
+
+def _of_tracks(passes: Sequence[SimulatedPasses], name: str) -> NDArray[Any]:
     """Return something of all tracks of all passes, one after the other."""
-    return np.concatenate([getattr(one.tracks, name) for one in passes])
+    return np.concatenate([getattr(group.tracks, name) for group in passes])
 
 
-def _of_each(passes: Sequence[SimulatedPass], texts: list[str]) -> pa.Array:
-    """Return a text a pass, repeated for each of its tracks."""
-    number = np.repeat(np.arange(len(passes)), [len(one.tracks.sign) for one in passes])
-    return arrow_texts(texts).take(arrow_numbers(number))
+def _of_each(passes: Sequence[SimulatedPasses], name: str) -> pa.Array:
+    """Return a name of the pass of every track."""
+    parts = [arrow_texts([getattr(ids, name) for ids in group.ids]) for group in passes]
+    return pa.concat_arrays([p.take(arrow_numbers(g.tracks.pass_number)) for p, g in zip(parts, passes, strict=True)])
 
 
 def _named(names: NDArray[np.object_], code: Ints) -> pa.Array:
@@ -169,13 +190,10 @@ def _named(names: NDArray[np.object_], code: Ints) -> pa.Array:
     return arrow_texts(names.tolist()).take(index)
 
 
-def _times(passes: Sequence[SimulatedPass], name: str) -> Times:
+def _times(passes: Sequence[SimulatedPasses], name: str) -> Times:
     """Return the time of a frame of every track, where the drive is dated."""
     return np.concatenate(
-        [
-            np.full(len(one.tracks.sign), _NEVER) if one.times is None else one.times[getattr(one.tracks, name)]
-            for one in passes
-        ]
+        [group.times[group.pass_start[group.tracks.pass_number] + getattr(group.tracks, name)] for group in passes]
     )
 
 

@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 from geofleet.algorithms.fragments import join_fragments
 from geofleet.algorithms.information import PolarNoise, TrackRows, information_form, pass_bias
 from geofleet.algorithms.kalman import track_kalman
-from geofleet.algorithms.sensing import GHOST, FrameDetections, SignField, sense_pass
+from geofleet.algorithms.sensing import GHOST, FrameDetections, SignField
+from geofleet.algorithms.sensing_chain import sense_pass
 from geofleet.algorithms.sensor_model import SensorModel
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import TrackerModel, track_ideal, track_paper, track_pass
@@ -151,9 +152,9 @@ def test_the_bias_of_a_pass_is_found_as_sure_as_it_says():
         seen, reported = street_pass(vehicle)
         bias = pass_bias(seen, reported, TrackRows.of(track_ideal(seen)), NOISE)
         range_unit, bearing_unit = pass_streams(5, replicate=0, vehicle=vehicle).calibration.standard_normal(2)
-        error = bias.mean - [2.4 * range_unit, np.deg2rad(1.2) * bearing_unit]
-        chi2.append(error @ np.linalg.solve(bias.cov, error))
-    assert np.sqrt(np.diag(bias.cov)) == pytest.approx([0, 0], abs=0.05)  # 5 cm, and far below a degree
+        error = bias.mean[0] - [2.4 * range_unit, np.deg2rad(1.2) * bearing_unit]
+        chi2.append(error @ np.linalg.solve(bias.cov[0], error))
+    assert np.sqrt(np.diag(bias.cov[0])) == pytest.approx([0, 0], abs=0.05)  # 5 cm, and far below a degree
     assert stats.kstest(chi2, "chi2", (2,)).pvalue > P_MIN
 
 
@@ -163,7 +164,7 @@ def test_a_bias_known_to_be_none_stays_none_and_exact_detections_give_exact_plac
     seen, reported = street_pass(0, exact)
     rows = TrackRows.of(track_ideal(seen))
     bias = pass_bias(seen, reported, rows, noise)
-    assert bias.mean.tolist() == [0.0, 0.0]
+    assert bias.mean.tolist() == [[0.0, 0.0]]
     form = information_form(seen, reported, rows, noise, bias.mean)
     np.testing.assert_allclose(form.origin_xy_m[track_ideal(seen)], seen.xy_m, atol=1e-6)
     assert form.s0.max() < 1e-6

@@ -19,8 +19,8 @@ from geofleet.algorithms.sensing import (
     ghost_tracks,
     in_view_of,
     miss_rate,
-    sense_pass,
 )
+from geofleet.algorithms.sensing_chain import sense_pass
 from geofleet.algorithms.sensor_model import SensorModel
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.trajectory import (

@@ -14,6 +14,7 @@ from geofleet.algorithms.sensing import (
     Sightings,
     SignField,
     draw_calibration,
+    ghost_frames,
     ghosts,
     in_view_of,
     keep_detected,
@@ -21,8 +22,8 @@ from geofleet.algorithms.sensing import (
     projected,
     recognised,
     reported_poses,
-    sense_pass,
 )
+from geofleet.algorithms.sensing_chain import sense_pass
 from geofleet.algorithms.sensor_model import SensorModel
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.trajectory import Poses, drive_line, resample, wander
@@ -212,7 +213,8 @@ def test_ghost_rate_is_per_hectare_and_frame() -> None:
 
 def test_ghosts_are_poisson_and_uniform_over_the_cone() -> None:
     n_frames = 20_000
-    seen, class_code = ghosts(n_frames, n_classes=5, model=NOISY, rng=np.random.default_rng(9))
+    rng = np.random.default_rng(9)
+    seen, class_code = ghosts(ghost_frames(n_frames, NOISY, rng), n_classes=5, model=NOISY, rng=rng)
     rate = NOISY.ghosts_per_frame
     assert rate == pytest.approx(2.0 * 0.1309, rel=1e-3)
     counts = np.bincount(np.minimum(np.bincount(seen.frame, minlength=n_frames), 3), minlength=4)

@@ -11,7 +11,8 @@ from scipy import stats
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from geofleet.algorithms.sensing import GHOST, FrameDetections, SignField, sense_pass
+from geofleet.algorithms.sensing import GHOST, FrameDetections, SignField
+from geofleet.algorithms.sensing_chain import sense_pass
 from geofleet.algorithms.sensor_model import SensorModel
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import TrackerModel, split_tracks, summarise, track_ideal, track_paper, track_pass

@@ -303,7 +303,7 @@ def test_a_failure_leaves_what_was_there(
     def fail(*_: object, **__: object) -> None:
         raise GeofleetError("disk full")
 
-    monkeypatch.setattr("geofleet.steps.simulate.track_pass", fail)
+    monkeypatch.setattr("geofleet.steps.simulate.track_passes", fail)
     with pytest.raises(GeofleetError, match="disk full"):
         run(inputs, out, 3)
     assert hash_path(out) == before
