@@ -22,23 +22,9 @@ from geofleet.steps.ingest import ingest_drive, ingest_signs
 from geofleet.steps.simulate import simulate
 from geofleet.tables.schemas import REFERENCE, SIGNS
 from geofleet.tables.store import read_table, write_table
+from geofleet.workflows.study.paper import paper_curve
 
 RAW = Path(__file__).parent.parent / "data" / "raw"
-# Paper, Figures 3 and 5: fleet size, F1, GOSPA_M and its standard deviation over ten runs, metres.
-PAPER = np.array(
-    [
-        (5, 0.7495, 1.5400, 0.4610),
-        (10, 0.8345, 1.2694, 0.2525),
-        (15, 0.8677, 1.1335, 0.2123),
-        (20, 0.8935, 1.1013, 0.2207),
-        (25, 0.9149, 1.0145, 0.2173),
-        (30, 0.9149, 0.9324, 0.2132),
-        (35, 0.9255, 0.9050, 0.1154),
-        (40, 0.9271, 0.8158, 0.2043),
-        (45, 0.9143, 0.8407, 0.1485),
-        (50, 0.9300, 0.7802, 0.1274),
-    ]
-)
 
 
 def scores(folder: Path, args: argparse.Namespace) -> list[dict[str, object]]:
@@ -60,7 +46,7 @@ def scores(folder: Path, args: argparse.Namespace) -> list[dict[str, object]]:
         reference = folder / "seen.parquet"
         write_table(SIGNS, seen.drop_columns(["n_passes_in_view", "n_frames_in_view"]), reference)
     totals: list[dict[str, object]] = []
-    for size in PAPER[:, 0].astype(int).tolist():
+    for size in [point.n_vehicles for point in paper_curve("gospa_m")]:
         fused = folder / f"fused-{size}.parquet"
         aggregate(simulation / "detections", fused, config=config, n_vehicles=size)
         totals += evaluate(fused, reference, folder / f"evaluation-{size}", config=config).totals
@@ -81,19 +67,20 @@ def main() -> None:
     print(f"{args.scenario}, seed {args.seed}, {args.replicates} replicates, {args.drive.name}")
     print(" V   F1 (paper)     tp   fp   fn   GOSPA_M mean sd median (paper mean sd)   z")
     inside = 0
-    for size, paper_f1, paper_mean, paper_sd in PAPER:
+    for point, paper_f1 in zip(paper_curve("gospa_m"), paper_curve("f1"), strict=True):
+        size = point.n_vehicles
         rows = [total for total in totals if total["n_vehicles"] == size]
         gospa_m, f1, tp, fp, fn = (
             np.array([row[name] for row in rows], float) for name in ("gospa_m", "f1", "tp", "fp", "fn")
         )
-        z = (gospa_m.mean() - paper_mean) / paper_sd
+        z = (gospa_m.mean() - point.mean) / point.sd
         inside += abs(z) <= 1
         print(
-            f"{size:3.0f}  {f1.mean():.3f} ({paper_f1:.3f})  {tp.mean():5.1f}{fp.mean():5.1f}{fn.mean():5.1f}"
+            f"{size:3.0f}  {f1.mean():.3f} ({paper_f1.mean:.3f})  {tp.mean():5.1f}{fp.mean():5.1f}{fn.mean():5.1f}"
             f"   {gospa_m.mean():.3f} {gospa_m.std(ddof=1):.3f} {np.median(gospa_m):.3f}"
-            f"  ({paper_mean:.3f} {paper_sd:.3f})  {z:+.2f}"
+            f"  ({point.mean:.3f} {point.sd:.3f})  {z:+.2f}"
         )
-    print(f"within the paper's mean ± 1 sd: {inside} of {len(PAPER)} fleet sizes")
+    print(f"within the paper's mean ± 1 sd: {inside} of {len(paper_curve('gospa_m'))} fleet sizes")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import track_passes
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats.layers import read_layer
-from geofleet.tables.fleets import Fleet, load_fleet
+from geofleet.tables.fleets import Fleet, load_fleet, together
 from geofleet.tables.manifest import hash_path, write_manifest
 from geofleet.tables.schemas import DETECTIONS, PASSES, REFERENCE, RUNS, TRUTH
 from geofleet.tables.simulated import (
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
     from geofleet.algorithms.billboards import Billboards
     from geofleet.algorithms.sensing import PassSensing
+    from geofleet.algorithms.streams import PassStreams
     from geofleet.config import Config
     from geofleet.tables.fleets import Pass
     from geofleet.tables.schemas import Schema
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
 
 VEHICLES_A_PART = 250
 """Vehicles whose tracks are in memory at once, and in one file of `truth`: part of the layout, not a setting."""
-VEHICLES_A_BATCH = 10
+VEHICLES_A_BATCH = 25
 """Vehicles that a worker simulates before it makes tables of what they send: a table costs as much as two passes."""
 FOLDER_A_VEHICLE = 1000
 """Up to so many vehicles have a folder of detections each; those of larger fleets share `N_BUCKETS` by hash."""
@@ -268,7 +269,7 @@ def _parts(outputs: Iterator[_BatchOutput], tally: _Tally) -> Iterator[pa.Table]
 def _simulate_batch(fleet: Fleet, batch: _Batch) -> _BatchOutput:
     """Simulate one pass a vehicle, and write their detections when each has a folder."""
     passes, in_view, n_frame_detections = [], np.zeros((2, len(fleet.scene.sign_ids)), dtype=np.int64), 0
-    for drives in _by_kind(fleet, batch):
+    for drives in together(fleet.start(vehicle, _streams(batch.run, vehicle)) for vehicle in batch.vehicles):
         driven, sensed = _simulate_passes(fleet, batch.run, drives)
         in_view += _times_in_view(sensed, len(fleet.scene.sign_ids))
         n_frame_detections += len(sensed.detections.frame)
@@ -287,16 +288,6 @@ def _simulate_batch(fleet: Fleet, batch: _Batch) -> _BatchOutput:
     )
 
 
-def _by_kind(fleet: Fleet, batch: _Batch) -> list[list[Pass]]:
-    """Let the vehicles of a batch drive; those with one kind of sensor are sensed together."""
-    groups: dict[int, list[Pass]] = {}
-    for vehicle in batch.vehicles:
-        streams = pass_streams(batch.run.seed, replicate=batch.run.replicate, vehicle=vehicle)
-        drive = fleet.start(vehicle, streams)
-        groups.setdefault(id(drive.kind), []).append(drive)
-    return list(groups.values())
-
-
 def _simulate_passes(fleet: Fleet, run: _Run, drives: list[Pass]) -> tuple[SimulatedPasses, PassSensing]:
     """Sense and track passes with one kind of sensor."""
     kind, streams, settings = drives[0].kind, [drive.streams for drive in drives], fleet.config.fleet
@@ -313,6 +304,10 @@ def _simulate_passes(fleet: Fleet, run: _Run, drives: list[Pass]) -> tuple[Simul
         tracks=track_passes(sensed.detections, sensed.reported, kind.tracker, streams),
     )
     return passes, sensed
+
+
+def _streams(run: _Run, vehicle: int) -> PassStreams:
+    return pass_streams(run.seed, replicate=run.replicate, vehicle=vehicle)
 
 
 def _times_in_view(sensed: PassSensing, n_signs: int) -> Ints:

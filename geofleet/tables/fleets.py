@@ -18,6 +18,7 @@ from geofleet.tables.declared import Declared
 from geofleet.tables.scenes import Drive, Scene, load_drive, load_drives, pick_scene
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     import pyarrow as pa
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 MOST_GHOSTS_A_FRAME = 1000
+FRAMES_TOGETHER = 6000
+"""Frames of passes that are sensed together: enough to share the cost of a call, and they fit into the cache."""
 _NOT_OF_THE_MODEL = {"sensor_kind", "confusion", "confusion_in_group", "declares", "declared_sigma_scale"}
 
 
@@ -125,6 +128,19 @@ class Fleet:
         )
         true = _timed(true, way.line, fleet, streams.pose)
         return Pass(vehicle, streams, way, kind, true, _frame_times(way.drive, true, vehicle * fleet.headway_s))
+
+
+def together(passes: Iterable[Pass]) -> list[list[Pass]]:
+    """Group passes that are sensed together: of one kind of sensor, and up to `FRAMES_TOGETHER` frames in all."""
+    groups: list[list[Pass]] = []
+    filling: dict[int, list[Pass]] = {}
+    for one in passes:
+        group = filling.get(id(one.kind), [])
+        if not group or sum(len(other.times) for other in group) + len(one.times) > FRAMES_TOGETHER:
+            group = filling[id(one.kind)] = []
+            groups.append(group)
+        group.append(one)
+    return groups
 
 
 def load_fleet(layer: pa.Table, drive: Path, *, source: Path, config: Config) -> Fleet:

@@ -126,9 +126,9 @@ def passes_table(passes: Sequence[SimulatedPasses], frame: EnuFrame) -> pa.Table
             "range_m": group.sensor.range_m,
             "fov_deg": group.sensor.fov_deg,
             "frame_spacing_m": frame_spacing_m,
-            **asdict(group.declared),
+            **declared,
         }
-        for group in passes
+        for group, declared in ((group, asdict(group.declared)) for group in passes)
         for ids, drive_id, frame_spacing_m in zip(group.ids, group.drive_ids, group.frame_spacing_m, strict=True)
     ]
     columns: dict[str, object] = {name: [row[name] for row in rows] for name in rows[0]}
