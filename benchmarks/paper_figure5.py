@@ -9,6 +9,7 @@ Detections are simulated; signs and roads are real (© OpenStreetMap contributor
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -21,14 +22,18 @@ from geofleet.steps.evaluate import evaluate
 from geofleet.steps.ingest import ingest_drive, ingest_signs
 from geofleet.steps.simulate import simulate
 from geofleet.tables.schemas import REFERENCE, SIGNS
-from geofleet.tables.store import read_table, write_table
+from geofleet.tables.store import atomic_path, read_table, write_table
 from geofleet.workflows.study.paper import paper_curve
 
 RAW = Path(__file__).parent.parent / "data" / "raw"
 
 
-def scores(folder: Path, args: argparse.Namespace) -> list[dict[str, object]]:
-    """Simulate every replicate once and return the totals of every fleet size."""
+BLOCK = 10
+"""Replicates that are simulated, aggregated and scored before any is kept."""
+
+
+def scores(folder: Path, args: argparse.Namespace, replicates: range) -> list[dict[str, object]]:
+    """Simulate some replicates once and return the totals of every fleet size."""
     config = load_config(args.scenario, args.set)
     ingest_signs([RAW / "helsinki.osm.pbf"], folder / "signs.parquet")
     ingest_drive([args.drive], folder / "drives.parquet")
@@ -37,7 +42,8 @@ def scores(folder: Path, args: argparse.Namespace) -> list[dict[str, object]]:
         *(folder / "signs.parquet", folder / "drives.parquet", simulation),
         config=config,
         n_vehicles=50,
-        n_replicates=args.replicates,
+        n_replicates=len(replicates),
+        first_replicate=replicates.start,
         seed=args.seed,
     )
     reference = simulation / "reference.parquet"
@@ -53,6 +59,24 @@ def scores(folder: Path, args: argparse.Namespace) -> list[dict[str, object]]:
     return totals
 
 
+def kept_scores(args: argparse.Namespace) -> list[dict[str, object]]:
+    """Return the totals of all replicates, block by block; those in the file to keep are not computed again."""
+    what = [args.scenario, *args.set, args.seed, args.drive.name, args.in_view]
+    blocks = json.loads(args.keep.read_text(encoding="utf-8")) if args.keep and args.keep.exists() else {}
+    totals = []
+    for first in range(0, args.replicates, BLOCK):
+        replicates = range(first, min(first + BLOCK, args.replicates))
+        key = " ".join(map(str, [*what, replicates.start, replicates.stop]))
+        if key not in blocks:
+            with TemporaryDirectory() as name:
+                blocks[key] = scores(Path(name), args, replicates)
+            if args.keep:
+                with atomic_path(args.keep) as draft:
+                    draft.write_text(json.dumps(blocks), encoding="utf-8")
+        totals += blocks[key]
+    return totals
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="paper")
@@ -61,9 +85,9 @@ def main() -> None:
     parser.add_argument("--replicates", type=int, default=24)
     parser.add_argument("--drive", type=Path, default=RAW / "helsinki_derived.pos")
     parser.add_argument("--in-view", action="store_true", help="leave out signs that no pass had in view")
+    parser.add_argument("--keep", type=Path, metavar="FILE.json", help="keep what is done, to go on from there")
     args = parser.parse_args()
-    with TemporaryDirectory() as name:
-        totals = scores(Path(name), args)
+    totals = kept_scores(args)
     print(f"{args.scenario}, seed {args.seed}, {args.replicates} replicates, {args.drive.name}")
     print(" V   F1 (paper)     tp   fp   fn   GOSPA_M mean sd median (paper mean sd)   z")
     inside = 0
@@ -73,12 +97,14 @@ def main() -> None:
         gospa_m, f1, tp, fp, fn = (
             np.array([row[name] for row in rows], float) for name in ("gospa_m", "f1", "tp", "fp", "fn")
         )
+        gospa_m = gospa_m[~np.isnan(gospa_m)]  # a map without a hit has none
         z = (gospa_m.mean() - point.mean) / point.sd
         inside += abs(z) <= 1
         print(
             f"{size:3.0f}  {f1.mean():.3f} ({paper_f1.mean:.3f})  {tp.mean():5.1f}{fp.mean():5.1f}{fn.mean():5.1f}"
             f"   {gospa_m.mean():.3f} {gospa_m.std(ddof=1):.3f} {np.median(gospa_m):.3f}"
             f"  ({point.mean:.3f} {point.sd:.3f})  {z:+.2f}"
+            + (f"  undefined in {n_undefined} runs" if (n_undefined := len(rows) - len(gospa_m)) else "")
         )
     print(f"within the paper's mean ± 1 sd: {inside} of {len(paper_curve('gospa_m'))} fleet sizes")
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geofleet.algorithms.information_kernels import locate, normal_equations
+from geofleet.algorithms.information_kernels import locate, misfit, normal_equations
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MIN_FRAMES = 3
 """Shorter tracks have no say in the bias of their pass: they may be ghosts."""
 N_ROUNDS = 4
-"""Gauss-Newton steps for the bias; two are enough unless the bias is tens of degrees."""
+"""Gauss-Newton steps for the bias that is sent; two are enough unless the bias is tens of degrees."""
 OUTLIER_SIGMAS = 5.0
 RANK_TOLERANCE = 1e-10
 
@@ -120,16 +120,12 @@ def information_form(
     The place is found by Gauss-Newton steps that are damped until the residual falls (Levenberg-Marquardt), from the
     mean of the reported positions: without damping a track seen from one direction only runs away.
     """
-    poses = np.ascontiguousarray(reported.xy_m[seen.frame])
-    sigmas = np.array([noise.range_sigma_m, noise.bearing_sigma_rad])
     bias = bias[rows.pass_of(seen)]
-    place = locate(rows.start, rows.order, seen.xy_m, seen.range_m, seen.azimuth_rad, poses, sigmas, bias)
-    matrix, gradient, square = normal_equations(
-        rows.start, rows.order, seen.range_m, seen.azimuth_rad, poses, sigmas, bias, place
-    )
-    value, axes = np.linalg.eigh(matrix / _scale(noise))  # in sigmas, so that one tolerance fits metres and radians
+    place, matrix, gradient, square = linearised(seen, reported, rows, noise, bias)
+    scale = np.outer(1 / _unit(noise), 1 / _unit(noise))
+    value, axes = np.linalg.eigh(matrix / scale)
     is_seen = value > RANK_TOLERANCE * value[:, -1:]
-    in_axes = np.einsum("tij,ti->tj", axes, gradient / _scale(noise)[0])
+    in_axes = np.einsum("tij,ti->tj", axes, gradient / scale[0])
     explained = np.sum(np.where(is_seen, in_axes**2 / np.where(is_seen, value, 1.0), 0.0), axis=1)
     return Information(
         origin_xy_m=place,
@@ -140,16 +136,41 @@ def information_form(
     )
 
 
-def _scale(noise: PolarNoise) -> Floats:
-    """Return the outer product of what a unit of each unknown is counted in."""
-    unit = np.array([1.0, 1.0, 1.0, noise.bearing_sigma_rad / noise.range_sigma_m])
-    return np.outer(1 / unit, 1 / unit)
+def linearised(
+    seen: FrameDetections, reported: Poses, rows: TrackRows, noise: PolarNoise, bias: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return the place of each track under its bias, (n_tracks, 2), and N, HᵀWε and εᵀWε there."""
+    poses = np.ascontiguousarray(reported.xy_m[seen.frame])
+    sigmas = np.array([noise.range_sigma_m, noise.bearing_sigma_rad])
+    place = locate(rows.start, rows.order, seen.xy_m, seen.range_m, seen.azimuth_rad, poses, sigmas, bias)
+    equations = normal_equations(rows.start, rows.order, seen.range_m, seen.azimuth_rad, poses, sigmas, bias, place)
+    return place, *equations
 
 
-def pass_bias(seen: FrameDetections, reported: Poses, rows: TrackRows, noise: PolarNoise) -> PassBias:
+def _unit(noise: PolarNoise) -> Floats:
+    """Return what each unknown is counted in, so that one tolerance fits metres and radians."""
+    return np.array([1.0, 1.0, 1.0, noise.bearing_sigma_rad / noise.range_sigma_m])
+
+
+def pass_bias(
+    seen: FrameDetections,
+    reported: Poses,
+    rows: TrackRows,
+    noise: PolarNoise,
+    *,
+    start: Floats | None = None,
+    n_rounds: int = N_ROUNDS,
+) -> PassBias:
     """Return the bias of each pass from its own tracks (`bias_posterior`).
 
     Tracks whose residual is beyond `OUTLIER_SIGMAS` are left out: two signs in one track say nothing about the sensor.
+
+    Parameters
+    ----------
+    start
+        Bias of each pass to linearise at first, (n_passes, 2); none by default.
+    n_rounds
+        Gauss-Newton steps.
     """
     n_passes = len(seen.pass_start) - 1
     mean, cov = np.zeros((n_passes, 2)), np.tile(noise.bias_cov, (n_passes, 1, 1))
@@ -158,10 +179,16 @@ def pass_bias(seen: FrameDetections, reported: Poses, rows: TrackRows, noise: Po
         return PassBias(mean, cov)
     of_pass = rows.pass_of(seen)
     has_tracks = np.bincount(of_pass, minlength=n_passes) > 0
-    for _ in range(N_ROUNDS):
-        form = information_form(seen, reported, rows, noise, mean)
-        used = form.s0 <= form.dof + OUTLIER_SIGMAS * np.sqrt(2 * np.maximum(form.dof, 1))
-        schur, right = about_bias(form.matrix[used], form.vector[used])
+    if start is not None:
+        mean[has_tracks] = start[has_tracks]
+    for _ in range(n_rounds):
+        bias = mean[of_pass]
+        _, matrix, gradient, square = linearised(seen, reported, rows, noise, bias)
+        s0, rank = misfit(matrix, gradient, square, 1 / _unit(noise), RANK_TOLERANCE)
+        dof = 2.0 * np.diff(rows.start) - rank
+        used = s0 <= dof + OUTLIER_SIGMAS * np.sqrt(2 * np.maximum(dof, 1))
+        vector = gradient + (matrix[:, :, 2:] @ bias[:, :, None])[:, :, 0]
+        schur, right = about_bias(matrix[used], vector[used])
         says = _by_pass(np.column_stack((schur.reshape(-1, 4), right)), of_pass[used], n_passes)
         found = bias_posterior(says[:, :4].reshape(-1, 2, 2), says[:, 4:], np.sqrt(np.diag(noise.bias_cov)))
         mean[has_tracks], cov[has_tracks] = found[0][has_tracks], found[1][has_tracks]

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from geofleet.algorithms.assignment import NONE, _assign, _Graph  # the compiled core: one call a frame
-from geofleet.algorithms.information_kernels import NEAREST_M, wrapped
+from geofleet.algorithms.information_kernels import expected, wrapped
 from geofleet.algorithms.tracking_kernels import _without_stale
 
 if TYPE_CHECKING:
@@ -41,6 +41,27 @@ class Filter(NamedTuple):
     max_missed_frames: int
 
 
+class _Seen(NamedTuple):
+    """What one pass detects, (n,) each."""
+
+    range_m: Floats
+    azimuth_rad: Floats
+    class_code: Ints
+
+
+class _Tracks(NamedTuple):
+    """The state of every track and its readings of each class; room for as many as there are detections.
+
+    `weight[k]` is what a class weighs that lags behind by k readings, against the one most read.
+    """
+
+    mean: Floats  # (n, 4)
+    cov: Floats  # (n, 4, 4)
+    votes: Ints  # (n, n_classes)
+    last_frame: Ints  # (n,)
+    weight: Floats  # (VOTES_AWAY + 1,)
+
+
 @njit(cache=True, nogil=True)
 def associate_filtered(  # noqa: PLR0917 - numba takes no keyword-only arguments
     frame_start: Ints, range_m: Floats, azimuth_rad: Floats, class_code: Ints, pose_xy_m: Floats, model: Filter
@@ -51,43 +72,50 @@ def associate_filtered(  # noqa: PLR0917 - numba takes no keyword-only arguments
     ½ m² + ½ ln|2πS| - ln P(class), m² being the squared innovation under S and below the gate, against the density of
     births.
     """
-    n = len(range_m)
-    track, last_frame = np.empty(n, np.int64), np.empty(n, np.int64)
-    mean, cov = np.empty((n, 4)), np.empty((n, 4, 4))
-    votes = np.zeros((n, model.n_classes), np.int64)
-    live, n_live, n_tracks = np.empty(n, np.int64), 0, 0
+    n, none = len(range_m), np.empty(0, np.int64)
+    seen = _Seen(range_m, azimuth_rad, class_code)
+    tracks = _Tracks(
+        np.empty((n, 4)),
+        np.empty((n, 4, 4)),
+        np.zeros((n, model.n_classes), np.int64),
+        np.empty(n, np.int64),
+        _weights(model),
+    )
+    track, live, choice, holder = (
+        np.empty(n, np.int64),
+        np.empty(n, np.int64),
+        np.empty(n, np.int64),
+        np.empty(n, np.int64),
+    )
+    graph = _Graph(np.zeros(n + 1, np.int64), none, np.empty(0), np.zeros(n))  # room that frames share, and it grows
+    n_live, n_tracks = 0, 0
     for frame in range(len(frame_start) - 1):
         first, last = frame_start[frame], frame_start[frame + 1]
-        n_live = _without_stale(live, n_live, last_frame, frame - 1 - model.max_missed_frames)
-        taken = np.full(last - first, NONE)
-        if n_live and last > first:
-            seen = slice(first, last)
-            candidates = _candidates(
-                live[:n_live],
-                mean,
-                cov,
-                votes,
-                range_m[seen],
-                azimuth_rad[seen],
-                class_code[seen],
-                pose_xy_m[frame],
-                model,
+        x, y = pose_xy_m[frame, 0], pose_xy_m[frame, 1]
+        n_live = _without_stale(live, n_live, tracks.last_frame, frame - 1 - model.max_missed_frames)
+        if n_live * (last - first) > len(graph.cost):
+            n_pairs = 2 * n_live * (last - first)
+            graph = _Graph(graph.start, np.empty(n_pairs, np.int64), np.empty(n_pairs), graph.skip_cost)
+        if _pairs(live, n_live, tracks, seen, first, last, x, y, model, graph, choice, holder):
+            n_pairs = graph.start[n_live]
+            own = _Graph(
+                graph.start[: n_live + 1], graph.column[:n_pairs], graph.cost[:n_pairs], graph.skip_cost[:n_live]
             )
-            column_of_track = _assign(candidates, last - first)
-            for k in range(n_live):
-                if column_of_track[k] != NONE:
-                    taken[column_of_track[k]] = live[k]
+            choice[:n_live] = _assign(own, last - first)
         for i in range(first, last):
-            if taken[i - first] == NONE:
-                taken[i - first] = live[n_live] = n_tracks
-                _begin(mean[n_tracks], cov[n_tracks], range_m[i], azimuth_rad[i], pose_xy_m[frame], model)
+            track[i] = NONE
+        for k in range(n_live):
+            if choice[k] != NONE:
+                track[first + choice[k]] = live[k]
+        for i in range(first, last):
+            if track[i] == NONE:
+                track[i] = live[n_live] = n_tracks
+                _begin(tracks, n_tracks, range_m[i], azimuth_rad[i], x, y, model)
                 n_live, n_tracks = n_live + 1, n_tracks + 1
             else:
-                t = taken[i - first]
-                _update(mean[t], cov[t], range_m[i], azimuth_rad[i], pose_xy_m[frame], model)
-            t = track[i] = taken[i - first]
-            votes[t, class_code[i]] += 1
-            last_frame[t] = frame
+                _update(tracks, track[i], range_m[i], azimuth_rad[i], x, y, model)
+            tracks.votes[track[i], class_code[i]] += 1
+            tracks.last_frame[track[i]] = frame
     return track
 
 
@@ -136,111 +164,144 @@ def associate_filtered_passes(  # noqa: PLR0917 - numba takes no keyword-only ar
 
 
 @njit(cache=True, nogil=True)
-def _candidates(  # noqa: PLR0917 - numba takes no keyword-only arguments
+def _pairs(  # noqa: PLR0917 - numba takes no keyword-only arguments
     live: Ints,
-    mean: Floats,
-    cov: Floats,
-    votes: Ints,
-    range_m: Floats,
-    azimuth_rad: Floats,
-    class_code: Ints,
-    pose_xy_m: Floats,
+    n_live: int,
+    tracks: _Tracks,
+    seen: _Seen,
+    first: int,
+    last: int,
+    x: float,
+    y: float,
     model: Filter,
-) -> _Graph:
-    """Return the pairs of live tracks and detections inside the gate, with what each saves over a birth."""
-    start, n_pairs = np.zeros(len(live) + 1, np.int64), 0
-    column, cost = np.empty(len(live) * len(range_m), np.int64), np.empty(len(live) * len(range_m))
-    jacobian = np.empty((2, 4))
-    for k in range(len(live)):
-        t = live[k]
-        expected_range, expected_azimuth = _expect(mean[t], pose_xy_m, jacobian)
-        rr, ra, aa = _innovation_cov(jacobian, cov[t], model)
+    graph: _Graph,
+    choice: Ints,
+    holder: Ints,
+) -> bool:
+    """Write the pairs of live tracks and detections inside the gate, with what each saves over a birth.
+
+    Return whether two tracks would take one detection; if not, what each takes is best (`choice`, from `first` on).
+    """
+    n_pairs, is_contested = 0, False
+    for j in range(last - first):
+        holder[j] = NONE
+    for k in range(n_live):
+        t, choice[k], least = live[k], NONE, 0.0
+        distance, azimuth, ux, uy = expected(tracks.mean[t, 0], tracks.mean[t, 1], x, y)
+        rr, ra, aa = _innovation_cov(tracks.cov, t, distance, ux, uy, model)
         det = rr * aa - ra * ra
-        most_likely = votes[t].max()
-        for j in range(len(range_m)):
-            er, ea = range_m[j] - expected_range, wrapped(azimuth_rad[j] - expected_azimuth)
-            chi2 = (aa * er * er - 2 * ra * er * ea + rr * ea * ea) / det
-            if chi2 < model.gate_chi2:
-                likelihood = -0.5 * chi2 - np.log(2 * np.pi) - 0.5 * np.log(det)
-                likelihood += _log_class(votes[t], most_likely, class_code[j], model)
-                column[n_pairs] = j
-                cost[n_pairs] = LOG_BIRTH_DENSITY - np.log(model.n_classes) - likelihood
+        for j in range(last - first):
+            er = seen.range_m[first + j] - distance - tracks.mean[t, 2]
+            ea = wrapped(seen.azimuth_rad[first + j] - azimuth - tracks.mean[t, 3])
+            weighted = aa * er * er - 2 * ra * er * ea + rr * ea * ea
+            if weighted < model.gate_chi2 * det:
+                likelihood = -0.5 * weighted / det - np.log(2 * np.pi) - 0.5 * np.log(det)
+                likelihood += _log_class(tracks, t, seen.class_code[first + j], model)
+                cost = LOG_BIRTH_DENSITY - np.log(model.n_classes) - likelihood
+                graph.column[n_pairs], graph.cost[n_pairs] = j, cost
                 n_pairs += 1
-        start[k + 1] = n_pairs
-    return _Graph(start, column[:n_pairs], cost[:n_pairs], np.zeros(len(live)))
+                if cost < least:
+                    least, choice[k] = cost, j
+        graph.start[k + 1] = n_pairs
+        if choice[k] != NONE:
+            is_contested |= holder[choice[k]] != NONE
+            holder[choice[k]] = k
+    return is_contested
 
 
 @njit(cache=True, nogil=True)
-def _log_class(votes: Ints, most: int, class_code: int, model: Filter) -> float:
-    """Return ln Σ_k π_k M_kc: the chance to read this class on the sign that was read like this before."""
+def _misread(model: Filter) -> float:
+    """Return the chance to read one certain wrong class."""
+    return model.class_error_rate / max(model.n_classes - 1, 1)
+
+
+@njit(cache=True, nogil=True)
+def _weights(model: Filter) -> Floats:
+    weights = np.ones(VOTES_AWAY + 1)
+    for k in range(VOTES_AWAY):
+        weights[k + 1] = weights[k] * _misread(model) / (1 - model.class_error_rate)
+    return weights
+
+
+@njit(cache=True, nogil=True)
+def _log_class(tracks: _Tracks, t: int, class_code: int, model: Filter) -> float:
+    """Return ln Σ_k π_k M_kc: the chance to read this class on the sign that track t read like this before."""
     if model.n_classes == 1:
         return 0.0
-    misread = model.class_error_rate / (model.n_classes - 1)
-    vote = np.log((1 - model.class_error_rate) / misread)  # what one reading is worth
-    total = 0.0
+    most, total = 0, 0.0
     for k in range(model.n_classes):
-        if most - votes[k] <= VOTES_AWAY:
-            total += np.exp(vote * (votes[k] - most))
-    share = np.exp(vote * (votes[class_code] - most)) / total
+        most = max(most, tracks.votes[t, k])
+    for k in range(model.n_classes):
+        if most - tracks.votes[t, k] <= VOTES_AWAY:
+            total += tracks.weight[most - tracks.votes[t, k]]
+    behind, misread = most - tracks.votes[t, class_code], _misread(model)
+    share = tracks.weight[behind] / total if behind <= VOTES_AWAY else 0.0
     likelihood: float = np.log(misread + share * (1 - model.class_error_rate - misread))
     return likelihood
 
 
 @njit(cache=True, nogil=True)
-def _expect(mean: Floats, pose_xy_m: Floats, jacobian: Floats) -> tuple[float, float]:
-    """Return the range and azimuth to be measured, and write their derivatives by the state."""
-    dx, dy = mean[0] - pose_xy_m[0], mean[1] - pose_xy_m[1]
-    distance = max(np.sqrt(dx * dx + dy * dy), NEAREST_M)
-    jacobian[0, 0], jacobian[0, 1], jacobian[0, 2], jacobian[0, 3] = dx / distance, dy / distance, 1.0, 0.0
-    jacobian[1, 0], jacobian[1, 1] = -dy / distance**2, dx / distance**2
-    jacobian[1, 2], jacobian[1, 3] = 0.0, 1.0
-    return distance + mean[2], np.arctan2(dy, dx) + mean[3]
-
-
-@njit(cache=True, nogil=True)
-def _innovation_cov(jacobian: Floats, cov: Floats, model: Filter) -> tuple[float, float, float]:
-    """Return rr, ra, aa of S = H P Hᵀ + R."""
-    rr, ra, aa = model.range_var_m2, 0.0, model.bearing_var_rad2
-    for p in range(4):
-        for q in range(4):
-            rr += jacobian[0, p] * cov[p, q] * jacobian[0, q]
-            ra += jacobian[0, p] * cov[p, q] * jacobian[1, q]
-            aa += jacobian[1, p] * cov[p, q] * jacobian[1, q]
-    return rr, ra, aa
+def _innovation_cov(  # noqa: PLR0917 - numba takes no keyword-only arguments
+    cov: Floats, t: int, distance: float, ux: float, uy: float, model: Filter
+) -> tuple[float, float, float]:
+    """Return rr, ra, aa of S = H P Hᵀ + R; the rows of H are (ux, uy, 1, 0) and (-uy / d, ux / d, 0, 1)."""
+    rx, ry = -uy / distance, ux / distance
+    r0, r1 = ux * cov[t, 0, 0] + uy * cov[t, 1, 0] + cov[t, 2, 0], ux * cov[t, 0, 1] + uy * cov[t, 1, 1] + cov[t, 2, 1]
+    r2, r3 = ux * cov[t, 0, 2] + uy * cov[t, 1, 2] + cov[t, 2, 2], ux * cov[t, 0, 3] + uy * cov[t, 1, 3] + cov[t, 2, 3]
+    a0, a1 = rx * cov[t, 0, 0] + ry * cov[t, 1, 0] + cov[t, 3, 0], rx * cov[t, 0, 1] + ry * cov[t, 1, 1] + cov[t, 3, 1]
+    a3 = rx * cov[t, 0, 3] + ry * cov[t, 1, 3] + cov[t, 3, 3]
+    rr = ux * r0 + uy * r1 + r2 + model.range_var_m2
+    aa = rx * a0 + ry * a1 + a3 + model.bearing_var_rad2
+    return rr, rx * r0 + ry * r1 + r3, aa
 
 
 @njit(cache=True, nogil=True)
 def _begin(  # noqa: PLR0917 - numba takes no keyword-only arguments
-    mean: Floats, cov: Floats, range_m: float, azimuth_rad: float, pose_xy_m: Floats, model: Filter
+    tracks: _Tracks, t: int, range_m: float, azimuth_rad: float, x: float, y: float, model: Filter
 ) -> None:
     """Start a track where its first detection points, corrected by the bias as far as that is known."""
-    distance, angle = range_m - model.bias[0], azimuth_rad - model.bias[1]
+    mean, cov, bias, bias_cov = tracks.mean, tracks.cov, model.bias, model.bias_cov
+    distance, angle = range_m - bias[0], azimuth_rad - bias[1]
     ux, uy = np.cos(angle), np.sin(angle)
-    mean[0], mean[1] = pose_xy_m[0] + distance * ux, pose_xy_m[1] + distance * uy
-    mean[2], mean[3] = model.bias[0], model.bias[1]
-    turn = np.array([[ux, -distance * uy], [uy, distance * ux]])  # of the place, by range and by angle
-    noise = model.bias_cov.copy()
-    noise[0, 0] += model.range_var_m2
-    noise[1, 1] += model.bearing_var_rad2
-    cross = turn @ model.bias_cov
-    cov[:2, :2] = turn @ noise @ turn.T
-    cov[:2, 2:] = -cross
-    cov[2:, :2] = -cross.T
-    cov[2:, 2:] = model.bias_cov
+    mean[t, 0], mean[t, 1], mean[t, 2], mean[t, 3] = x + distance * ux, y + distance * uy, bias[0], bias[1]
+    range_var, angle_var = bias_cov[0, 0] + model.range_var_m2, bias_cov[1, 1] + model.bearing_var_rad2
+    both = bias_cov[0, 1]
+    for p in range(2):
+        by_range, by_angle = (ux, -distance * uy) if p == 0 else (uy, distance * ux)  # how the place turns
+        for q in range(2):
+            range_q, angle_q = (ux, -distance * uy) if q == 0 else (uy, distance * ux)
+            cov[t, p, q] = by_range * (range_var * range_q + both * angle_q)
+            cov[t, p, q] += by_angle * (both * range_q + angle_var * angle_q)
+            cov[t, p, 2 + q] = cov[t, 2 + q, p] = -(by_range * bias_cov[0, q] + by_angle * bias_cov[1, q])
+            cov[t, 2 + p, 2 + q] = bias_cov[p, q]
 
 
 @njit(cache=True, nogil=True)
 def _update(  # noqa: PLR0917 - numba takes no keyword-only arguments
-    mean: Floats, cov: Floats, range_m: float, azimuth_rad: float, pose_xy_m: Floats, model: Filter
+    tracks: _Tracks, t: int, range_m: float, azimuth_rad: float, x: float, y: float, model: Filter
 ) -> None:
     """Take a detection in: range first, then azimuth, each a scalar update of the extended filter."""
-    jacobian = np.empty((2, 4))
-    for axis in range(2):
-        expected_range, expected_azimuth = _expect(mean, pose_xy_m, jacobian)
-        error = range_m - expected_range if axis == 0 else wrapped(azimuth_rad - expected_azimuth)
-        along = cov @ jacobian[axis]
-        variance = jacobian[axis] @ along + (model.range_var_m2 if axis == 0 else model.bearing_var_rad2)
-        for p in range(4):
-            mean[p] += along[p] * error / variance
-            for q in range(4):
-                cov[p, q] -= along[p] * along[q] / variance
+    mean, cov = tracks.mean, tracks.cov
+    distance, _, ux, uy = expected(mean[t, 0], mean[t, 1], x, y)
+    _take_in(mean, cov, t, ux, uy, 2, range_m - distance - mean[t, 2], model.range_var_m2)
+    distance, azimuth, ux, uy = expected(mean[t, 0], mean[t, 1], x, y)
+    error = wrapped(azimuth_rad - azimuth - mean[t, 3])
+    _take_in(mean, cov, t, -uy / distance, ux / distance, 3, error, model.bearing_var_rad2)
+
+
+@njit(cache=True, nogil=True)
+def _take_in(  # noqa: PLR0917 - numba takes no keyword-only arguments
+    mean: Floats, cov: Floats, t: int, hx: float, hy: float, own: int, error: float, noise_var: float
+) -> None:
+    """Take one number in that measures hx · east + hy · north + the bias `own`."""
+    a0 = hx * cov[t, 0, 0] + hy * cov[t, 0, 1] + cov[t, 0, own]
+    a1 = hx * cov[t, 1, 0] + hy * cov[t, 1, 1] + cov[t, 1, own]
+    a2 = hx * cov[t, 2, 0] + hy * cov[t, 2, 1] + cov[t, 2, own]
+    a3 = hx * cov[t, 3, 0] + hy * cov[t, 3, 1] + cov[t, 3, own]
+    along = (a0, a1, a2, a3)
+    variance = hx * a0 + hy * a1 + along[own] + noise_var
+    for p in range(4):
+        gain = along[p] / variance
+        mean[t, p] += gain * error
+        for q in range(4):
+            cov[t, p, q] -= gain * along[q]

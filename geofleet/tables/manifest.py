@@ -22,8 +22,8 @@ _PACKAGES = ("geofleet", "duckdb", "numpy", "numba", "scipy", "pyarrow", "pyproj
 
 
 def manifest_path(out: Path) -> Path:
-    """Return where the manifest of an output stands: inside a folder, beside a file (`signs_manifest.json`)."""
-    return out.with_name(f"{out.stem}_manifest.json") if out.suffix else out / "_manifest.json"
+    """Return where the manifest of an output that exists stands: in a folder, beside a file (`signs_manifest.json`)."""
+    return out / "_manifest.json" if out.is_dir() else out.with_name(f"{out.stem}_manifest.json")
 
 
 def write_manifest(

@@ -13,7 +13,15 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from geofleet.algorithms.fragments import join_fragments
-from geofleet.algorithms.information import PolarNoise, TrackRows, information_form, pass_bias
+from geofleet.algorithms.information import (
+    RANK_TOLERANCE,
+    PolarNoise,
+    TrackRows,
+    information_form,
+    linearised,
+    pass_bias,
+)
+from geofleet.algorithms.information_kernels import misfit
 from geofleet.algorithms.kalman import track_kalman
 from geofleet.algorithms.sensing import GHOST, FrameDetections, SignField
 from geofleet.algorithms.sensing_chain import sense_pass
@@ -144,6 +152,28 @@ def test_the_residual_is_chi_squared_with_its_degrees_of_freedom():
         probability += stats.chi2.cdf(form.s0, form.dof).tolist()
     assert len(probability) > 300
     assert stats.kstest(probability, "uniform").pvalue > P_MIN
+
+
+def test_elimination_finds_the_residual_and_rank_that_eigenvalues_do():
+    seen, reported = street_pass(4)
+    rows = TrackRows.of(track_ideal(seen))
+    bias = pass_bias(seen, reported, rows, NOISE).mean
+    form = information_form(seen, reported, rows, NOISE, bias)
+    _, matrix, gradient, square = linearised(seen, reported, rows, NOISE, bias[rows.pass_of(seen)])
+    unit = np.array([1.0, 1.0, 1.0, NOISE.range_sigma_m / NOISE.bearing_sigma_rad])
+    s0, rank = misfit(matrix, gradient, square, unit, RANK_TOLERANCE)
+    assert set(rank.tolist()) == {2, 4}  # a single frame, of a ghost, sees a place or a bias
+    np.testing.assert_array_equal(2 * np.diff(rows.start) - rank, form.dof)
+    np.testing.assert_allclose(s0, form.s0, rtol=1e-6, atol=1e-6)
+
+
+def test_a_bias_from_a_good_start_needs_one_round():
+    seen, reported = street_pass(6)
+    rows = TrackRows.of(track_ideal(seen))
+    bias = pass_bias(seen, reported, rows, NOISE)
+    again = pass_bias(seen, reported, rows, NOISE, start=bias.mean, n_rounds=1)
+    np.testing.assert_allclose(again.mean, bias.mean, atol=1e-5)
+    np.testing.assert_allclose(again.cov, bias.cov, rtol=1e-5)
 
 
 def test_the_bias_of_a_pass_is_found_as_sure_as_it_says():

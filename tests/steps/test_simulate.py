@@ -293,6 +293,16 @@ def test_a_folder_of_something_else_is_not_replaced(inputs: tuple[Path, Path], t
         run(inputs, out / "thesis.tex", 1)
 
 
+def test_a_folder_with_a_dot_in_its_name_holds_its_manifest_and_can_be_replaced(
+    inputs: tuple[Path, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "gnss-0.5"
+    run(inputs, out, 1)
+    run(inputs, out, 2)
+    assert (out / "_manifest.json").exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["gnss-0.5"]
+
+
 def test_a_failure_leaves_what_was_there(
     inputs: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
