@@ -13,7 +13,8 @@ import pyarrow.parquet as pq
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats import osm
 from geofleet.formats.osm_value import is_own_osm
-from geofleet.formats.reading import LayerRead, LayerStream, read_head
+from geofleet.formats.reading import BZIP2, GZIP, LayerRead, LayerStream, read_head, unpacked_head
+from geofleet.formats.xml import root_tag
 from geofleet.tables.schemas import LANES, SIGNS, Schema
 from geofleet.tables.store import read_table
 
@@ -90,6 +91,8 @@ def recognise(path: Path) -> str:
     head = read_head(path)
     if head.startswith(b"PAR1"):
         return _OWN if _is_own_table(path) else _INVENTORY
+    if root_tag(unpacked_head(path) if head.startswith((GZIP, BZIP2)) else head) == "OpenDRIVE":
+        return _OPENDRIVE
     encoding = osm.detect(head)
     if encoding == "osm" and is_own_osm(head):
         return _OWN_OSM
@@ -97,8 +100,6 @@ def recognise(path: Path) -> str:
         return _LANELET2 if import_module("geofleet.formats.lanelet2_map").is_lanelet2(path) else osm.FORMAT
     if encoding:
         return osm.FORMAT
-    if import_module("geofleet.formats.opendrive").detect(head):
-        return _OPENDRIVE
     return _INVENTORY if import_module("geofleet.formats.inventory").detect(head) else ""
 
 

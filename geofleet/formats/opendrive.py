@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["FORMAT", "detect", "read_lanes", "read_signs"]
 
 FORMAT = "opendrive"
+BARE_ROADS = "roads without a planView"
 _POLE_WITHIN_M = 0.5
 _BEYOND_M = 1.0
 _NOT_FOR_SIGNS = ("lanes", "type", "repeat", "tunnel", "bridge", "objectReference")
@@ -81,9 +82,10 @@ def read_signs(
             if element.tag == "header":
                 header = element
                 continue
-            with in_road(element):
-                road = _new_road(element, roads)
-                _read_signals(element, road, reader, poles)
+            if _has_line(element, reader.skipped):
+                with in_road(element):
+                    _read_signals(element, _new_road(element, roads), reader, poles)
+        _refuse_all_bare(roads, reader.skipped)
         georeference = read_georeference(header, crs=crs, origin=origin)
         placed, x, y, height, heading = _placed(reader, roads)
         lon, lat = georeference.to_lonlat(x, y)
@@ -91,6 +93,8 @@ def read_signs(
         support = _supports(placed, x, y, poles, roads)
     columns = _columns(placed, path.name) | {"height_m": height, "facing_deg": facing, "support_id": support}
     counts = reader.found | {
+        "signal references": len(reader.references),
+        "signal references to a signal that the file does not hold": reader.n_dangling(),
         "unknown codes": sum(not signal.meaning.known for signal in placed.values()),
         "plates without a main sign": sum(
             signal.kind == "plate" and parent is None
@@ -120,8 +124,10 @@ def read_lanes(path: Path, *, crs: str | None = None, origin: tuple[float, float
             if element.tag == "header":
                 header = element
                 continue
-            with in_road(element):
-                read_lane_lines(element, _new_road(element, roads), lines)
+            if _has_line(element, lines.skipped):
+                with in_road(element):
+                    read_lane_lines(element, _new_road(element, roads), lines)
+        _refuse_all_bare(roads, lines.skipped)
         geometry = lines.to_degrees(read_georeference(header, crs=crs, origin=origin))
     columns = {
         "lane_id": lines.lane_id,
@@ -137,6 +143,24 @@ def _positive(counts: Mapping[str, int]) -> dict[str, int]:
     return {what: n for what, n in counts.items() if n}
 
 
+def _has_line(road: Element, skipped: Counter[str]) -> bool:
+    """Tell whether a road has a reference line; one without has no place, and is counted with its signals."""
+    if children(road, "planView", "geometry"):
+        return True
+    skipped[BARE_ROADS] += 1
+    n_signals = len(children(road, "signals", "signal"))
+    if n_signals:
+        skipped["signals of roads without a planView"] += n_signals
+    return False
+
+
+def _refuse_all_bare(roads: Mapping[str, Road], skipped: Counter[str]) -> None:
+    if not roads and skipped[BARE_ROADS]:
+        raise InputError(
+            f"none of {skipped[BARE_ROADS]} roads has a planView with a geometry.", todo="Export it again."
+        )
+
+
 def _new_road(element: Element, roads: dict[str, Road]) -> Road:
     road = read_road(element)
     if road.road_id in roads:
@@ -148,9 +172,7 @@ def _new_road(element: Element, roads: dict[str, Road]) -> Road:
 def _read_signals(element: Element, road: Road, reader: SignalReader, poles: dict[str, Place]) -> None:
     for signal in children(element, "signals", "signal"):
         reader.add(signal, road.road_id)
-    n_references = len(children(element, "signals", "signalReference"))
-    if n_references:
-        reader.found["signal references"] += n_references
+    reader.references += [r.get("id", "").strip() for r in children(element, "signals", "signalReference")]
     for thing in children(element, "objects", "object"):
         pole = read_pole(thing, road.road_id)
         if pole is not None and thing.get("id"):

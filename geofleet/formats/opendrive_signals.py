@@ -116,6 +116,12 @@ class SignalReader:
     signals: list[Signal] = field(default_factory=list)
     skipped: Counter[str] = field(default_factory=Counter)
     found: Counter[str] = field(default_factory=Counter)
+    references: list[str] = field(default_factory=list)
+
+    def n_dangling(self) -> int:
+        """Return how many references name a signal that the file does not hold."""
+        known = {signal.signal_id for signal in self.signals}
+        return sum(signal_id not in known for signal_id in self.references)
 
     def add(self, element: Element, road_id: str) -> None:
         """Read one `<signal>` of a road, and the signs on it when it is a board."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from geofleet.errors import InputError
 from geofleet.formats import osm_json
-from geofleet.formats.reading import open_unpacked
+from geofleet.formats.reading import open_unpacked, unpacked_head
 from geofleet.formats.xml import iter_elements
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def copy_as_pbf(path: Path, encoding: str, copy: Path) -> None:
     """
     import osmium  # noqa: PLC0415  (libosmium is not needed for PBF)
 
-    if encoding == "osm.bz2" and osm_json.looks_like(osm_json.bz2_head(path)):
+    if encoding == "osm.bz2" and osm_json.looks_like(unpacked_head(path)):
         encoding = "json.bz2"
     with osmium.SimpleWriter(str(copy)) as writer:
         if encoding.startswith("json"):

@@ -48,15 +48,6 @@ def bunzipped(head: bytes) -> bytes:
         return b""
 
 
-def bz2_head(path: Path) -> bytes:
-    """Return the first bytes of what a bzip2 file holds; "" when it is damaged."""
-    try:
-        with bz2.open(path) as file:
-            return file.read(_HEAD_BYTES)
-    except (OSError, EOFError):
-        return b""
-
-
 def write_elements(answer: Iterable[Mapping[str, Any]], writer: osmium.SimpleWriter, *, where: str) -> None:
     """Write the nodes and ways of an answer to a file of another encoding.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import zlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, BinaryIO, cast
 
@@ -124,6 +125,15 @@ def open_unpacked(path: Path) -> BinaryIO:
     if mark.startswith(GZIP):
         return cast("BinaryIO", gzip.open(path))
     return cast("BinaryIO", bz2.open(path)) if mark == BZIP2 else path.open("rb")
+
+
+def unpacked_head(path: Path) -> bytes:
+    """Return the first bytes of what a packed file holds, b"" when it is damaged."""
+    try:
+        with open_unpacked(path) as file:
+            return file.read(_HEAD_BYTES)
+    except (OSError, EOFError, zlib.error):
+        return b""
 
 
 def refuse_long_lines(path: Path, *, max_bytes: int = MAX_LINE_BYTES) -> None:

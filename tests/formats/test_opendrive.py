@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import bz2
 import gzip
 import re
 from collections import Counter
@@ -14,6 +15,7 @@ from pyproj import CRS, Geod, Transformer
 from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.algorithms.road_geometry import reference_points
 from geofleet.errors import ConfigError, InputError
+from geofleet.formats import layers
 from geofleet.formats.countries import country_code
 from geofleet.formats.opendrive import detect, read_lanes, read_signs
 from geofleet.formats.opendrive_signals import BEYOND, NO_ID, NO_NUMBER, NO_PLACE, NO_ROAD
@@ -250,7 +252,6 @@ def test_signals_that_cannot_be_placed_are_counted(path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (road(plan=""), 'line 1: <road id="7">, road "7": the road has no planView'),
         (road(plan=STRAIGHT.replace("<line/>", "<bezier/>")), 'road "7": unknown geometry: <bezier>'),
         (road(plan=STRAIGHT.replace("<line/>", "")), "unknown geometry: nothing"),
         (road(plan=STRAIGHT.replace('x="0"', 'x="zero"')), r'<geometry>, road "7": x="zero" is no number'),
@@ -673,3 +674,28 @@ def test_semantics_say_what_an_unknown_code_means(read, inside, kind, sign_class
     assert (row["kind"], row["sign_class"], row["raw_code"]) == (kind, sign_class, "X9")
     known = read(signal("1", '<semantics><priority type="stop"/></semantics>')).table.to_pylist()[0]
     assert known["sign_class"] == "yield"
+
+
+def test_a_road_without_a_plan_view_is_counted_with_its_signals(path):
+    bare = road(road_id="9", plan="", signals=signal())
+    layer = read_signs(path(document(bare, road(signals=signal()))), origin=ORIGIN)
+    assert layer.table["road_id"].to_pylist() == ["7"]
+    assert layer.skipped == {"roads without a planView": 1, "signals of roads without a planView": 1}
+    with pytest.raises(InputError, match="none of 1 roads has a planView with a geometry"):
+        read_signs(path(document(bare)), origin=ORIGIN)
+    assert read_lanes(path(document(bare, road())), origin=ORIGIN).skipped["roads without a planView"] == 1
+
+
+def test_a_reference_to_a_signal_that_is_not_there_is_told(path):
+    references = '<signalReference s="1" t="2" id="1"/><signalReference s="2" t="2" id="99"/>'
+    layer = read_signs(path(document(road(signals=signal() + references))), origin=ORIGIN)
+    assert layer.found["signal references"] == 2
+    assert layer.found["signal references to a signal that the file does not hold"] == 1
+
+
+@pytest.mark.parametrize("pack", [gzip.compress, bz2.compress])
+def test_a_packed_file_is_recognised(tmp_path, pack):
+    packed = tmp_path / "map.xodr.packed"
+    packed.write_bytes(pack(document(road(signals=signal())).encode()))
+    assert layers.recognise(packed) == "opendrive"
+    assert read_signs(packed, origin=ORIGIN).table.num_rows == 1
