@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,6 +54,7 @@ INTEGERS = ("frame_first", "frame_last", "n_frames")
 TIMES = ("t_first", "t_last")
 _OPTIONS = ("crs", "scheme", "country", "run_id")
 _MAX_EXACT = 2.0**53
+_ROUNDING = 1.0 + 1e-6
 
 
 def given_columns(columns: Mapping[str, str] | Path | None) -> tuple[dict[str, str], dict[str, Any]]:
@@ -146,6 +148,47 @@ def integer_column(table: pa.Table, name: str | None) -> tuple[pa.Array, int]:
     whole = np.isfinite(values) & (values == np.round(values)) & (np.abs(values) < _MAX_EXACT)
     bad = int((pc.is_valid(text_column(table, name)).to_numpy(zero_copy_only=False) & ~whole).sum()) if name else 0
     return pa.array(np.where(whole, values, 0.0).astype(np.int64), mask=~whole), bad
+
+
+def number_of_track(table: pa.Table, name: str | None) -> pa.Array:
+    """Return the track ids as whole numbers; text gets the number that its hash is, the same wherever it stands."""
+    numbers_, n_other = integer_column(table, name)
+    if not n_other:
+        return numbers_
+    text = text_column(table, name).dictionary_encode()
+    hashes = [
+        int.from_bytes(hashlib.blake2b(one.encode(), digest_size=8).digest(), "big") >> 1
+        for one in text.dictionary.to_pylist()
+    ]
+    return pc.coalesce(numbers_, pa.array(hashes, pa.int64()).take(text.indices))
+
+
+def leave_out_impossible(columns: dict[str, Any]) -> dict[str, int]:
+    """Set what no detection can have to null, in place; return how many values by reason."""
+    sigma_e, sigma_n, covariance = (
+        columns[name].to_numpy(zero_copy_only=False) for name in ("sigma_e_m", "sigma_n_m", "cov_en_m2")
+    )
+    confidence = columns["class_confidence"].to_numpy(zero_copy_only=False)
+    distance = columns["range_mean_m"].to_numpy(zero_copy_only=False)
+    with np.errstate(invalid="ignore"):
+        wrong = {
+            "sigma_e_m": ("below zero", sigma_e < 0),
+            "sigma_n_m": ("below zero", sigma_n < 0),
+            "cov_en_m2": ("beyond what the sigmas allow", np.abs(covariance) > sigma_e * sigma_n * _ROUNDING),
+            "class_confidence": ("outside of 0 to 1", (confidence < 0) | (confidence > 1)),
+            "range_mean_m": ("below zero", distance < 0),
+            "n_frames": ("below one", pc.fill_null(pc.less(columns["n_frames"], 1), fill_value=False)),
+            "t_last": (
+                "before t_first",
+                pc.fill_null(pc.less(columns["t_last"], columns["t_first"]), fill_value=False),
+            ),
+        }
+    counts = {}
+    for name, (reason, flags) in wrong.items():
+        is_wrong = pa.array(flags)
+        columns[name] = pc.if_else(is_wrong, None, columns[name])
+        counts[f"{name} {reason}, left out"] = int(pc.sum(is_wrong).as_py() or 0)
+    return counts
 
 
 def time_column(table: pa.Table, name: str | None) -> tuple[pa.Array, int]:

@@ -26,7 +26,9 @@ from geofleet.formats.detection_columns import (
     choose_columns,
     given_columns,
     integer_column,
+    leave_out_impossible,
     number_column,
+    number_of_track,
     text_column,
     time_column,
 )
@@ -166,7 +168,9 @@ def _settled(plan: _Plan, batch: Batch, path: Path, found: Counter[str]) -> _Pla
             here = country_at(float(np.median(lon[placed])), float(np.median(lat[placed])))
             country = guess_country(codes, here)
             found[f"codes read as of {country} (guessed from codes and place)"] = int(country is not None)
-    found.update(doubts(lon[placed], lat[placed], country, where=str(path)))
+    stated = Counter(text_column(batch.table, plan.columns.get("country")).drop_null().to_pylist())
+    usual = country or (stated.most_common(1)[0][0].upper() if stated else None)
+    found.update(doubts(lon[placed], lat[placed], usual, where=str(path)))
     return replace(plan, scheme=scheme, country=country)
 
 
@@ -186,6 +190,7 @@ def _read(batch: Batch, plan: _Plan, path: Path, found: Counter[str]) -> Detecti
         for name in names:
             columns[name], n_bad = reader(table, chosen.get(name))
             found[f"{name} that cannot be read, left out"] += n_bad
+    found.update(leave_out_impossible(columns))
     found["codes that the vocabulary does not know"] += n_unknown
     columns = {name: values.filter(pa.array(good)) for name, values in columns.items()}
     skipped = Counter(value for value in reason.to_pylist() if value)
@@ -256,7 +261,7 @@ def _keys(table: pa.Table, plan: _Plan, row: NDArray[np.int64]) -> dict[str, pa.
     if "vehicle_id" in chosen:
         stated = pc.binary_join_element_wise(vehicle, stated, "/")
     own = pc.binary_join_element_wise("row", pc.utf8_lpad(number.cast(pa.string()), 10, "0"), "-")
-    track, _ = integer_column(table, chosen.get("track_id"))
+    track = number_of_track(table, chosen.get("track_id"))
     in_pass = pc.if_else(pc.is_valid(stated), number, 0)  # a row number tells the tracks of a pass apart
     track = pc.if_else(pc.is_valid(stated), pc.coalesce(track, in_pass), 0)
     return {"run_id": run, "vehicle_id": vehicle, "pass_id": pc.coalesce(stated, own), "track_id": track}
@@ -270,15 +275,11 @@ def _reasons(batch: Batch, plan: _Plan, lonlat: tuple[Floats, Floats], classes: 
     placed = np.isfinite(lon) & np.isfinite(lat)
     null = np.zeros(len(lon), bool)
     null[placed] = reject_null_island(lon[placed], lat[placed], where=str(path))
-    track, _ = integer_column(batch.table, plan.columns.get("track_id"))
-    no_track = pc.is_null(track).to_numpy(zero_copy_only=False)
-    told = pc.is_valid(text_column(batch.table, plan.columns.get("track_id"))).to_numpy(zero_copy_only=False)
     reasons = {
         "position missing or no number": ~stated,
         "position out of range": ~placed | (np.abs(lat) > _MAX_LAT_DEG),
         "position at 0° N 0° E, in the Gulf of Guinea": null,
         "class missing": pc.is_null(classes).to_numpy(zero_copy_only=False),
-        "track_id is no whole number": told & no_track,
     }
     first = np.argmax(np.column_stack([np.zeros(len(lon), bool), *reasons.values()]), axis=1)
     return pa.array([None, *reasons], pa.string()).take(pa.array(first))

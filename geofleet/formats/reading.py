@@ -110,6 +110,8 @@ def read_head(path: Path) -> bytes:
             head = file.read(_HEAD_BYTES)
     except FileNotFoundError:
         raise InputError("there is no such file.", where=str(path), todo="Check the path.") from None
+    except IsADirectoryError:
+        raise InputError("a folder, not a file.", where=str(path), todo=f"Name the files in it: {path}/*") from None
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"cannot be read: {reason}.", where=str(path), todo="Give a readable file.") from None

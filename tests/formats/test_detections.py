@@ -158,3 +158,42 @@ def test_values_of_openstreetmap_name_their_country_or_none(tmp_path):
     read = one(csv_file(tmp_path, "lon,lat,code\n8,53,DE:274[50]\n8,53,stop\n8,53,FI:361[40]\n"), scheme="osm")
     assert read.table["sign_class"].to_pylist() == ["speed_limit:50", "stop", "speed_limit:40"]
     assert "codes that the vocabulary does not know" not in read.found
+
+
+def test_track_ids_of_text_become_numbers_that_stay_the_same(tmp_path):
+    text = "pass_id,track_id,lon,lat,class\np,3,13,52,stop\np,a7,13,52,stop\nq,a7,13,52,stop\np,b,13,52,stop\n"
+    tracks = one(csv_file(tmp_path, text)).table["track_id"].to_pylist()
+    assert tracks[0] == 3
+    assert tracks[1] == tracks[2] != tracks[3]
+    again = one(csv_file(tmp_path, "pass_id,track_id,lon,lat,class\np,a7,13,52,stop\n", "b.csv"))
+    assert again.table["track_id"].to_pylist() == [tracks[1]]
+
+
+@pytest.mark.parametrize(
+    ("header", "values", "reason"),
+    [
+        ("sigma_e_m,sigma_n_m,cov_en_m2", "0.5,0.5,0.3", "cov_en_m2 beyond what the sigmas allow"),
+        ("sigma_e_m,sigma_n_m,cov_en_m2", "0.5,0.5,0.25", None),
+        ("sigma_e_m", "-0.1", "sigma_e_m below zero"),
+        ("class_confidence", "90", "class_confidence outside of 0 to 1"),
+        ("range_mean_m", "-1", "range_mean_m below zero"),
+        ("n_frames", "0", "n_frames below one"),
+        ("t_last,t_first", "2024-01-01T00:00:00Z,2024-01-01T00:00:01Z", "t_last before t_first"),
+    ],
+)
+def test_what_no_detection_can_have_is_left_out_and_told(tmp_path, header, values, reason):
+    read = one(csv_file(tmp_path, f"lon,lat,class,{header}\n13,52,stop,{values}\n"))
+    last = header.split(",")[-1] if "cov" in header else header.split(",")[0]
+    assert (read.table[last][0].as_py() is None) == (reason is not None)
+    assert not reason or read.found[f"{reason}, left out"] == 1
+
+
+def test_swapped_axes_are_refused_where_the_rows_name_their_country(tmp_path):
+    rows = "".join(f"52.{n},13.{n},206,DE\n" for n in range(3))
+    with pytest.raises(InputError, match=r"outside of DE, and inside with the axes swapped"):
+        one(csv_file(tmp_path, "lon,lat,code,country\n" + rows))
+
+
+def test_a_folder_is_no_file(tmp_path):
+    with pytest.raises(InputError, match=r"a folder, not a file.*/\*"):
+        one(tmp_path)
