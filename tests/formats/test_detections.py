@@ -161,12 +161,14 @@ def test_values_of_openstreetmap_name_their_country_or_none(tmp_path):
 
 
 def test_track_ids_of_text_become_numbers_that_stay_the_same(tmp_path):
-    text = "pass_id,track_id,lon,lat,class\np,3,13,52,stop\np,a7,13,52,stop\nq,a7,13,52,stop\np,b,13,52,stop\n"
-    tracks = one(csv_file(tmp_path, text)).table["track_id"].to_pylist()
-    assert tracks[0] == 3
-    assert tracks[1] == tracks[2] != tracks[3]
-    again = one(csv_file(tmp_path, "pass_id,track_id,lon,lat,class\np,a7,13,52,stop\n", "b.csv"))
-    assert again.table["track_id"].to_pylist() == [tracks[1]]
+    text = "pass_id,track_id,lon,lat,code\np,3,13,52,n\np,a7,13,52,a\nq,a7,13,52,a\np,b,13,52,b\n"
+    rows = one(csv_file(tmp_path, text)).table.to_pylist()
+    tracks = {row["raw_code"]: {r["track_id"] for r in rows if r["raw_code"] == row["raw_code"]} for row in rows}
+    assert tracks["n"] == {3}
+    assert len(tracks["a"]) == len(tracks["b"]) == 1
+    assert tracks["a"] != tracks["b"]
+    again = one(csv_file(tmp_path, "pass_id,track_id,lon,lat,code\np,a7,13,52,a\n", "b.csv"))
+    assert set(again.table["track_id"].to_pylist()) == tracks["a"]
 
 
 @pytest.mark.parametrize(
