@@ -1,55 +1,75 @@
 """Detections dealt to the tiles that read them: the one that owns each, and those in whose halo it lies.
 
 `sql/tiles/members.sql` says the same as a join. A join a detection costs several times what the rest of the step does;
-here a cell is looked up in a hash table, and most cells have one reader.
+here a cell is looked up in a hash table, and most cells have few readers.
 """
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
+    Rows32 = NDArray[np.int32]
 
 _CELL_BITS = 20  # of a column or row: cells of zoom 20 at most
+_COUNT_BITS = 20  # of the number of readers of a cell
 _EMPTY = -1
+_EDGE = 1e-6  # cells: two libraries' logarithms differ by less
+_READER = np.dtype(
+    [
+        *((name, np.float64) for name in ("west", "east", "north", "south")),
+        *((name, np.int32) for name in ("batch", "tile_code")),
+        ("is_owned", np.bool_),
+    ],
+    align=True,
+)
 
 
 class Readers(NamedTuple):
     """The tiles that read each cell: a hash table of cells, open addressing, whose entries are ranges of readers."""
 
-    slots: Ints  # (n_slots, 3) key of a cell or -1, its first reader and their number; n_slots is a power of two
-    batch: Ints  # (n,)
-    box: Floats  # (n, 4) west, east, north and south in cells, without bounds for the owner
+    slots: Ints  # (n_slots, 2) key of a cell or -1, and its readers: first << 20 | number; n_slots is a power of two
+    reader: NDArray[
+        np.void
+    ]  # (n,) box in cells, without bounds for the owner; batch and tile; whether it owns the cell
+    side: int  # cells along the equator
+    most: int  # readers of any cell
 
 
-def index_readers(run: Ints, cell_x: Ints, cell_y: Ints, batch: Ints, box: Floats) -> tuple[Readers, Ints]:
-    """Return the readers by cell, and the order that their rows are in.
+def index_readers(run: Ints, columns: Mapping[str, NDArray[np.generic]], fine_zoom: int) -> Readers:
+    """Return the readers by cell.
 
     Parameters
     ----------
-    run, cell_x, cell_y
-        (n,) the cell that each row reads.
-    batch
-        (n,) batch of the tile that reads it.
-    box
-        (n, 4) west, east, north and south of what it reads, in cells.
+    run
+        (n,) number of the run of each row.
+    columns
+        The columns of `sql/tiles/readers`, (n,) each.
+    fine_zoom
+        Zoom of the cells.
     """
-    key = _key(run, cell_x, cell_y)
+    key = _key(run, columns["cell_x"], columns["cell_y"])
     order = np.argsort(key, kind="stable")
+    reader = np.empty(key.size, _READER)
+    for name in _READER.names or ():
+        reader[name] = columns[name][order]
     keys, starts, counts = np.unique(key[order], return_index=True, return_counts=True)
-    slots = np.full((1 << max(4, int(2 * len(keys)).bit_length()), 3), _EMPTY, np.int64)
-    _fill_slots(slots, keys, starts.astype(np.int64), counts.astype(np.int64))
-    return Readers(slots, batch[order], np.ascontiguousarray(box[order])), order
+    slots = np.full((1 << max(4, int(2 * len(keys)).bit_length()), 2), _EMPTY, np.int64)
+    _fill_slots(slots, keys, (starts << _COUNT_BITS) | counts)
+    return Readers(slots, reader, 1 << fine_zoom, int(counts.max(initial=0)))
 
 
-def _key(run: Ints, cell_x: Ints, cell_y: Ints) -> Ints:
+def _key(run: Ints, cell_x: NDArray[np.generic], cell_y: NDArray[np.generic]) -> Ints:
     return (run.astype(np.int64) << 2 * _CELL_BITS) | (cell_y.astype(np.int64) << _CELL_BITS) | cell_x.astype(np.int64)
 
 
@@ -60,35 +80,58 @@ def _slot(key: int, mask: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _fill_slots(slots: Ints, keys: Ints, starts: Ints, counts: Ints) -> None:
+def _fill_slots(slots: Ints, keys: Ints, ranges: Ints) -> None:
     mask = len(slots) - 1
     for cell in range(keys.size):
         slot = _slot(keys[cell], mask)
         while slots[slot, 0] != _EMPTY:
             slot = (slot + 1) & mask
-        slots[slot, 0], slots[slot, 1], slots[slot, 2] = keys[cell], starts[cell], counts[cell]
+        slots[slot, 0], slots[slot, 1] = keys[cell], ranges[cell]
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _find(slots: Ints, key: int) -> int:
-    """Return the slot of a cell, or an empty one."""
+    """Return the readers of a cell, -1 if there are none."""
     mask = len(slots) - 1
     slot = _slot(key, mask)
     while slots[slot, 0] != key and slots[slot, 0] != _EMPTY:
         slot = (slot + 1) & mask
-    return slot
+    return slots[slot, 1]
 
 
 @njit(cache=True, nogil=True)
-def deal(run: Ints, x: Floats, y: Floats, readers: Readers, n_batches: int) -> tuple[Ints, Ints, Ints]:
-    """Return which rows each batch takes.
+def _find_beside(slots: Ints, key: int, x: float, y: float) -> int:
+    """Return the readers of the cell on whose edge a point lies that another logarithm puts into the next one."""
+    for step_x in range(-1, 2):
+        for step_y in range(-1, 2):
+            if math.floor(x + step_x * _EDGE) != math.floor(x) or math.floor(y + step_y * _EDGE) != math.floor(y):
+                found = _find(slots, key + (step_y << _CELL_BITS) + step_x)
+                if found != _EMPTY:
+                    return found
+    return _EMPTY
+
+
+@njit(cache=True, nogil=True)
+def _places(lon_deg: Floats, lat_deg: Floats, side: int) -> tuple[Floats, Floats]:
+    """Return column and row of the cells, with the fraction, as `sql/tiles/located` does."""
+    x, y = np.empty(lon_deg.size), np.empty(lon_deg.size)
+    for i in range(lon_deg.size):
+        x[i] = (0.0 if lon_deg[i] == 180.0 else lon_deg[i] + 180.0) / 360.0 * side  # noqa: PLR2004  (180 is -180)
+        sine = math.sin(math.radians(lat_deg[i]))
+        y[i] = (0.5 - math.log((1.0 + sine) / (1.0 - sine)) / (4.0 * math.pi)) * side
+    return x, y
+
+
+@njit(cache=True, nogil=True)
+def deal(run: Ints, lon_deg: Floats, lat_deg: Floats, readers: Readers, n_batches: int) -> tuple[Rows32, Rows32, Ints]:
+    """Return who reads which detection.
 
     Parameters
     ----------
     run
         (n,) run of each detection.
-    x, y
-        (n,) column and row of its cell, with the fraction.
+    lon_deg, lat_deg
+        (n,) its position.
     readers
         From `index_readers`. A detection whose cell nobody reads is left out.
     n_batches
@@ -96,67 +139,64 @@ def deal(run: Ints, x: Floats, y: Floats, readers: Readers, n_batches: int) -> t
 
     Returns
     -------
-    Row and reader of every copy, by batch and then in the order of the rows, and (n_batches + 1,) where each batch
-    starts.
+    Detection and reader of every copy, in the order of the detections, and (n_batches + 1,) where each batch starts
+    when they are sorted by batch.
     """
-    n = x.size
-    first, count = np.empty(n, np.int64), np.empty(n, np.int32)
+    x, y = _places(lon_deg, lat_deg, readers.side)
+    row, reader = np.empty(x.size * readers.most, np.int32), np.empty(x.size * readers.most, np.int32)
     start = np.zeros(n_batches + 1, np.int64)
-    for i in range(n):
+    n = 0
+    for i in range(x.size):
         key = int((np.int64(run[i]) << 2 * _CELL_BITS) | (np.int64(y[i]) << _CELL_BITS) | np.int64(x[i]))
-        slot = _find(readers.slots, key)
-        first[i], count[i] = readers.slots[slot, 1], max(readers.slots[slot, 2], 0)
-        for r in range(first[i], first[i] + count[i]):
-            if count[i] == 1 or _reads(readers.box, r, x[i], y[i]):  # a cell's only reader is its owner
-                start[readers.batch[r] + 1] += 1
+        found = _find(readers.slots, key)
+        if found == _EMPTY:
+            found = _find_beside(readers.slots, key, x[i], y[i])
+        count = max(found, 0) & ((1 << _COUNT_BITS) - 1)
+        for r in range(found >> _COUNT_BITS, (found >> _COUNT_BITS) + count):
+            one = readers.reader[r]
+            if one.is_owned or (one.west <= x[i] <= one.east and one.north <= y[i] <= one.south):
+                row[n], reader[n] = i, r
+                n += 1
+                start[one.batch + 1] += 1
     for batch in range(n_batches):
         start[batch + 1] += start[batch]
-    row, reader = np.empty(start[n_batches], np.int64), np.empty(start[n_batches], np.int64)
-    at = start[:-1].copy()
-    for i in range(n):
-        for r in range(first[i], first[i] + count[i]):
-            if count[i] == 1 or _reads(readers.box, r, x[i], y[i]):
-                batch = readers.batch[r]
-                row[at[batch]], reader[at[batch]] = i, r
-                at[batch] += 1
-    return row, reader, start
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _reads(box: Floats, r: int, x: float, y: float) -> bool:
-    return bool(box[r, 0] <= x <= box[r, 1] and box[r, 2] <= y <= box[r, 3])
+    return row[:n], reader[:n], start
 
 
 @njit(cache=True, nogil=True)
 def take_rows(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
     dealt: NDArray[np.void],
-    row: Ints,
-    reader: Ints,
-    by_reader: tuple[NDArray[np.int32], NDArray[np.bool_]],
+    row: Rows32,
+    reader: Rows32,
+    start: Ints,
+    readers: Readers,
     floats: tuple[Floats, ...],
     whole: tuple[Ints, ...],
     codes: tuple[NDArray[np.int32], ...],
 ) -> None:
-    """Fill records with the columns of the rows dealt: one pass over them, and no copy of a column.
+    """Fill records, by batch, with the columns of the rows dealt; in a batch they stay in the order of the rows.
+
+    Columns are read in order and every batch is written in order, which caches like.
 
     Parameters
     ----------
     dealt
         (m,) records to fill: `lon`, `lat`, `var_m2`, `class_confidence`, `track_id`, `t_first_us`, `t_last_us`,
         `tile_code`, `pass_code`, `class_code`, `is_owned`.
-    row, reader
-        (m,) from `deal`.
-    by_reader
-        Tile of every reader, and whether it owns the cell.
+    row, reader, start
+        From `deal`.
+    readers
+        From `index_readers`.
     floats, whole, codes
         The columns of the rows, in the order of the records.
     """
-    tile, is_owned = by_reader
+    at = start.copy()
     for i in range(row.size):
-        r = row[i]
-        record = dealt[i]
+        r, one = row[i], readers.reader[reader[i]]
+        record = dealt[at[one.batch]]
+        at[one.batch] += 1
         record.lon, record.lat = floats[0][r], floats[1][r]
         record.var_m2, record.class_confidence = floats[2][r], floats[3][r]
         record.track_id, record.t_first_us, record.t_last_us = whole[0][r], whole[1][r], whole[2][r]
         record.pass_code, record.class_code = codes[0][r], codes[1][r]
-        record.tile_code, record.is_owned = tile[reader[i]], is_owned[reader[i]]
+        record.tile_code, record.is_owned = one.tile_code, one.is_owned

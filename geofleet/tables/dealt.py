@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from geofleet.algorithms.dealing import Readers
-
     Columns = dict[str, NDArray[Any]]
     Ints = NDArray[np.int64]
 
@@ -36,7 +34,7 @@ _ROW = np.dtype(
 
 
 class Dealer:
-    """Deals blocks of rows (`sql/tiles/located`) to one file a batch below a folder.
+    """Deals blocks of rows (`sql/aggregate/coded`) to one file a batch below a folder.
 
     Parameters
     ----------
@@ -44,21 +42,20 @@ class Dealer:
         Where the batches go, `batch_path(folder, number)`.
     readers
         The table `sql/tiles/readers`.
+    fine_zoom
+        Zoom of the cells.
     run_of_tile, run_of_pass
         Number of the run of every tile and of every pass.
     """
 
-    def __init__(self, folder: Path, readers: pa.Table, *, run_of_tile: Ints, run_of_pass: Ints) -> None:
+    def __init__(
+        self, folder: Path, readers: pa.Table, *, fine_zoom: int, run_of_tile: Ints, run_of_pass: Ints
+    ) -> None:
         columns = {name: readers[name].to_numpy() for name in readers.column_names if name != "run_id"}
-        box = np.column_stack([columns[name] for name in ("west", "east", "north", "south")])
-        batch = columns["batch"].astype(np.int64)
-        self._readers: Readers
-        self._readers, order = index_readers(
-            run_of_tile[columns["tile_code"]], columns["cell_x"], columns["cell_y"], batch, box
-        )
-        self._by_reader = columns["tile_code"][order], columns["is_owned"][order]
-        self._n_batches = int(batch.max(initial=-1)) + 1
+        self._readers = index_readers(run_of_tile[columns["tile_code"]], columns, fine_zoom)
+        self._n_batches = int(columns["batch"].max(initial=-1)) + 1
         self._run_of_pass, self._folder = run_of_pass, folder
+        self._dealt = np.empty(0, _ROW)
 
     def deal_all(self, blocks: pa.RecordBatchReader) -> None:
         """Deal all blocks; the next one is made while one is dealt."""
@@ -72,17 +69,18 @@ class Dealer:
                 dealing.result()
 
     def _deal(self, block: pa.RecordBatch) -> None:
-        column = {
-            name: block.column(name).to_numpy(zero_copy_only=False) for name in block.schema.names if name != "run_id"
-        }
+        column = {name: block.column(name).to_numpy(zero_copy_only=False) for name in block.schema.names}
         run = self._run_of_pass[column["pass_code"]]
-        row, reader, start = deal(run, column["x"], column["y"], self._readers, self._n_batches)
-        dealt = np.empty(row.size, _ROW)
+        row, reader, start = deal(run, column["lon"], column["lat"], self._readers, self._n_batches)
+        if (
+            row.size > self._dealt.size
+        ):  # memory that is used again and again: a fresh page costs more than what it holds
+            self._dealt = np.empty(row.size + row.size // 4, _ROW)
         kinds = (tuple(column[name] for name in names) for names in (_FLOATS, _WHOLE, _CODES))
-        take_rows(dealt, row, reader, self._by_reader, *kinds)
+        take_rows(self._dealt, row, reader, start, self._readers, *kinds)
         for number in np.flatnonzero(np.diff(start)).tolist():
             with batch_path(self._folder, number).open("ab") as file:
-                dealt[start[number] : start[number + 1]].tofile(file)
+                file.write(self._dealt[start[number] : start[number + 1]].view(np.uint8))
 
 
 def batch_path(folder: Path, number: int) -> Path:

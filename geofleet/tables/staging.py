@@ -128,7 +128,20 @@ def judge_detections(connection: duckdb.DuckDBPyConnection, detections: Path, *,
     _report_passes(connection)
     materialise(connection, "aggregate/fleet", {"n_vehicles": n_vehicles})
     materialise(connection, "aggregate/passes")
-    create_view(connection, "aggregate/usable")
+    _select_usable(connection)
+
+
+def _select_usable(connection: duckdb.DuckDBPyConnection) -> None:
+    """Make the view `usable`: what `sql/aggregate/usable` says or, where all rows can be used, plainly all of them.
+
+    A filter that keeps every row still costs as much as reading them.
+    """
+    n_bad = connection.table("reporting").aggregate("sum(n_rows - n_usable)").fetchall()[0][0]
+    n_copies = connection.table("copies").aggregate("count(*)").fetchall()[0][0]
+    if n_bad or n_copies:
+        create_view(connection, "aggregate/usable")
+    else:
+        connection.table("judged").project("* EXCLUDE (reason)").create_view("usable")
 
 
 def judged(connection: duckdb.DuckDBPyConnection) -> Judged:
@@ -169,7 +182,6 @@ def _deal(connection: duckdb.DuckDBPyConnection, folder: Path, *, fine_zoom: int
     passes = connection.sql("SELECT DISTINCT pass_code, run_id, pass_hash FROM passes ORDER BY pass_code").fetchnumpy()
     run_ids, run_of_pass = np.unique(np.asarray(passes["run_id"], str), return_inverse=True)
     write_pass_hashes(folder, np.asarray(passes["pass_hash"], np.uint64))
-    create_view(connection, "aggregate/points")
     run_of_tile = np.searchsorted(run_ids, np.asarray(tiles["run_id"], str))
-    dealer = Dealer(folder, readers, run_of_tile=run_of_tile, run_of_pass=run_of_pass)
-    dealer.deal_all(run(connection, "tiles/located", {"fine_zoom": fine_zoom}).to_arrow_reader(BLOCK_ROWS))
+    dealer = Dealer(folder, readers, fine_zoom=fine_zoom, run_of_tile=run_of_tile, run_of_pass=run_of_pass)
+    dealer.deal_all(run(connection, "aggregate/coded").to_arrow_reader(BLOCK_ROWS))

@@ -1,5 +1,5 @@
 -- why: every detection in the tile that owns it and, as halo, in every other tile that must know it. For analysts: the
---      step deals the rows of tiles/located in a compiled kernel (algorithms/dealing), and a test demands the same rows
+--      step deals the rows of aggregate/coded in a compiled kernel (algorithms/dealing), and a test demands the same rows
 -- reads: @tiles/located, @tiles/readers
 -- params: none
 -- writes: batch INTEGER, tile_code INTEGER, is_owned BOOLEAN, pass_code INTEGER, track_id BIGINT, class_code INTEGER,
