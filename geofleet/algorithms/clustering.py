@@ -133,8 +133,8 @@ def _checked(xy: ArrayLike) -> Floats:
         return np.empty((0, _PLANE))
     if points.ndim != _PLANE or points.shape[1] != _PLANE:
         raise InputError(f"points have shape {points.shape}, not (n, 2).", where="dbscan")
-    n_bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
-    if n_bad:
+    if not np.isfinite(points).all():
+        n_bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
         raise InputError(
             f"{n_bad} of {len(points)} points have a coordinate that is not finite.",
             where="dbscan",

@@ -271,3 +271,37 @@ def label_points(
                     point.append(at)
                     reached.append(found[k])
     return labels, is_core, np.array(point, dtype=np.int64), np.array(reached, dtype=np.int64)
+
+
+@njit(cache=True, nogil=True)
+def join_parts(order: Ints, point: Ints, cluster: Ints, is_core: Flags) -> tuple[Ints, Ints]:
+    """Join clusters that share a core.
+
+    Parameters
+    ----------
+    order
+        (n,) rows sorted by point.
+    point, cluster, is_core
+        (n,) of each row: its point, the cluster that it is in, whether it is a core.
+
+    Returns
+    -------
+    Of each cluster the lowest number of those that it is joined with, and of each lowest number its first core.
+    """
+    n_clusters = cluster.max() + 1 if cluster.size else np.int64(0)
+    parent = np.arange(n_clusters).astype(np.int32)
+    last = np.int64(-1)
+    for row in order:
+        if is_core[row]:
+            if last >= 0 and point[last] == point[row]:
+                a, b = _root(parent, cluster[last]), _root(parent, cluster[row])
+                parent[max(a, b)] = min(a, b)
+            last = row
+    joined, first_core = np.empty(n_clusters, np.int64), np.full(n_clusters, np.iinfo(np.int64).max)
+    for k in range(n_clusters):
+        joined[k] = _root(parent, k)
+    for row in order:
+        if is_core[row]:
+            root = joined[cluster[row]]
+            first_core[root] = min(first_core[root], point[row])
+    return joined, first_core

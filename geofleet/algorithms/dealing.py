@@ -200,3 +200,23 @@ def take_rows(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
         record.track_id, record.t_first_us, record.t_last_us = whole[0][r], whole[1][r], whole[2][r]
         record.pass_code, record.class_code = codes[0][r], codes[1][r]
         record.tile_code, record.is_owned = one.tile_code, one.is_owned
+
+
+@njit(cache=True, nogil=True)
+def unpack_rows(
+    dealt: NDArray[np.void],
+) -> tuple[Floats, Floats, Floats, Floats, Ints, Ints, Ints, Ints, Ints, Ints, NDArray[np.bool_]]:
+    """Return the columns of records that `take_rows` filled, in the order of their fields; numbers are 64 bits wide."""
+    n = dealt.size
+    lon, lat, var_m2, confidence = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    track, t_first, t_last = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    pass_code, class_code, tile_code = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    is_owned = np.empty(n, np.bool_)
+    for i in range(n):
+        record = dealt[i]
+        lon[i], lat[i] = record.lon, record.lat
+        var_m2[i], confidence[i] = record.var_m2, record.class_confidence
+        track[i], t_first[i], t_last[i] = record.track_id, record.t_first_us, record.t_last_us
+        pass_code[i], class_code[i], tile_code[i] = record.pass_code, record.class_code, record.tile_code
+        is_owned[i] = record.is_owned
+    return lon, lat, var_m2, confidence, track, t_first, t_last, pass_code, class_code, tile_code, is_owned

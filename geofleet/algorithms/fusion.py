@@ -68,7 +68,9 @@ def information_weights(var_m2: Floats) -> Floats:
     return 1.0 / (COMMON_SIGMA_M**2 + var_m2)
 
 
-def fuse(lon_deg: Floats, lat_deg: Floats, *, weight: Floats, pass_code: Ints, first: Ints) -> FusedSigns:
+def fuse(
+    lon_deg: Floats, lat_deg: Floats, *, weight: Floats, pass_code: Ints, first: Ints, ecef_m: Floats | None = None
+) -> FusedSigns:
     """Estimate the position of every cluster and its covariance.
 
     The centroid is the weighted mean in the plane that touches the ellipsoid at the first member. Its covariance
@@ -83,10 +85,13 @@ def fuse(lon_deg: Floats, lat_deg: Floats, *, weight: Floats, pass_code: Ints, f
         (n,) members, sorted by cluster, pass and track.
     first
         (n_clusters + 1,) `first[k]:first[k + 1]` are the members of cluster k; none is empty.
+    ecef_m
+        (n, 3) the members as `ecef_points` gives them, where the caller has them.
     """
     lead = first[:-1]
-    origin, axes = ecef_points(lon_deg[lead], lat_deg[lead]), local_axes(lon_deg[lead], lat_deg[lead])
-    centre, covariance, n_passes = _sum_members(ecef_points(lon_deg, lat_deg), origin, axes, weight, pass_code, first)
+    xyz = ecef_points(lon_deg, lat_deg) if ecef_m is None else ecef_m
+    origin, axes = xyz[lead], local_axes(lon_deg[lead], lat_deg[lead])
+    centre, covariance, n_passes = _sum_members(xyz, origin, axes, weight, pass_code, first)
     lon, lat = _on_ground(origin, axes, centre)
     return FusedSigns(
         lon_deg=np.round(lon, POSITION_DIGITS),

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from geofleet.algorithms.clustering import dbscan_groups
+from geofleet.algorithms.clustering_kernels import join_parts
 from geofleet.algorithms.geodesy_kernels import ecef_points, local_axes, tile_planes
 from geofleet.errors import InputError
 
@@ -124,6 +123,7 @@ def cluster_tiles(
     codes: Ints,
     eps_m: float,
     min_samples: int,
+    ecef_m: Floats | None = None,
 ) -> TileClusters:
     """Cluster points tile by tile, within codes.
 
@@ -141,8 +141,10 @@ def cluster_tiles(
         (n,) integers from 0; no cluster spans two (classes; zeros to ignore them).
     eps_m, min_samples
         As for `clustering.dbscan`. Rows may come in any order: `join_open` settles what depends on it.
+    ecef_m
+        (n, 3) the points as `ecef_points` gives them, where the caller has them.
     """
-    ecef = ecef_points(lon_deg, lat_deg)
+    ecef = ecef_points(lon_deg, lat_deg) if ecef_m is None else ecef_m
     groups = tile * (int(codes.max(initial=0)) + 1) + codes
     lon0, lat0 = np.ascontiguousarray(tile_centres_deg[:, 0]), np.ascontiguousarray(tile_centres_deg[:, 1])
     plane = tile_planes(ecef, tile, ecef_points(lon0, lat0), local_axes(lon0, lat0))
@@ -187,17 +189,9 @@ def join_open(point: Ints, cluster: Ints, is_core: Flags, is_owned: Flags) -> tu
     """
     if point.size == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    _, part = np.unique(cluster, return_inverse=True)
-    _, node = np.unique(point, return_inverse=True)
-    n_parts, n_nodes = int(part.max()) + 1, int(node.max()) + 1
-    links = coo_array(
-        (np.ones(np.count_nonzero(is_core), np.int8), (part[is_core], n_parts + node[is_core])),
-        shape=(n_parts + n_nodes, n_parts + n_nodes),
-    )
-    _, component = connected_components(links, directed=False)
-    whole = component[part].astype(np.int64)
-    first_core = np.full(int(component.max()) + 1, np.iinfo(np.int64).max)
-    np.minimum.at(first_core, whole[is_core], point[is_core])
+    order = np.argsort(point, kind="stable")
+    joined, first_core = join_parts(order, point, cluster, is_core)
+    whole = joined[cluster]
     row = np.flatnonzero(is_owned)
     row = row[np.lexsort((first_core[whole[row]], point[row]))]
     row = row[np.append(True, np.diff(point[row]) != 0)]
@@ -227,7 +221,7 @@ def split_chains(
 
     Returns
     -------
-    (n,) clusters numbered anew, -1 for noise.
+    (n,) clusters numbered anew, -1 for noise; `cluster` itself where none has a core rule of its own.
     """
     is_first = np.append(True, np.diff(cluster) != 0)
     group = np.cumsum(is_first) - 1
@@ -236,7 +230,7 @@ def split_chains(
     least = np.maximum(min_samples, np.ceil(share * n_passes)).astype(np.int64)
     again = least[group] > min_samples
     if not again.any():
-        return group
+        return cluster
     lon0, lat0 = lon_deg[is_first], lat_deg[is_first]
     ecef = ecef_points(lon_deg[again], lat_deg[again])
     plane = tile_planes(ecef, group[again], ecef_points(lon0, lat0), local_axes(lon0, lat0))

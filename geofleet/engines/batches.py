@@ -13,6 +13,7 @@ import numpy as np
 
 from geofleet.algorithms.clustering_kernels import radix_argsort
 from geofleet.algorithms.fusion import fuse, hash_members, information_weights, move_to_members, vote
+from geofleet.algorithms.geodesy_kernels import ecef_points
 from geofleet.algorithms.tiling import cluster_tiles, join_open, quadkey_bounds, split_chains
 from geofleet.tables.dealt import read_rows
 
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 _FUSED = frozenset(
     {
         *("lon", "lat", "var_m2", "class_confidence", "track_id", "t_first_us", "t_last_us"),
-        *("run_code", "pass_code", "pass_hash", "class_code"),
+        *("run_code", "pass_code", "pass_hash", "class_code", "ecef_m"),
     }
 )  # what a sign is made from
 
@@ -61,6 +62,7 @@ class TileResult:
 def cluster_batch(task: TileTask) -> TileResult:
     """Cluster one batch of tiles by DBSCAN, fuse the clusters that are all its own and hand back the others."""
     rows = read_rows(task.path)
+    rows["ecef_m"] = ecef_points(rows["lon"], rows["lat"])
     tile = rows["tile_code"] - task.first_tile
     rows["run_code"] = np.asarray(task.runs, np.int64)[tile]
     bounds = quadkey_bounds(task.tiles)
@@ -73,6 +75,7 @@ def cluster_batch(task: TileTask) -> TileResult:
         codes=rows["class_code"] if task.semantic == "first" else np.zeros_like(rows["class_code"]),
         eps_m=task.eps_m,
         min_samples=task.min_samples,
+        ecef_m=rows["ecef_m"],
     )
     open_rows = {name: values[found.open_row] for name, values in rows.items()}
     open_rows |= {"cluster": found.open_cluster, "is_core": found.open_is_core}
@@ -95,7 +98,7 @@ def fuse_open(parts: Sequence[Columns], split: Splitter | None = None) -> Column
     rows = concatenate(numbered)
     if not rows:
         return {}
-    order = np.lexsort((rows["track_id"], rows["pass_code"]))
+    order = _key_order(rows["track_id"], rows["pass_code"])
     is_new = (np.diff(rows["pass_code"][order], prepend=-1) != 0) | (np.diff(rows["track_id"][order], prepend=0) != 0)
     point = np.empty(len(order), np.int64)
     point[order] = np.cumsum(is_new)
@@ -129,18 +132,27 @@ def fuse_members(
     """
     if cluster.size == 0:
         return {}
-    order = _key_order(rows["track_id"][member], rows["pass_code"][member], cluster)
+    order = _key_order(rows["track_id"][member], rows["pass_code"][member])
+    order = radix_argsort(cluster, order)
     taken, cluster = member[order], cluster[order]
-    if splitter:
-        cluster = splitter(rows["lon"][taken], rows["lat"][taken], cluster, rows["pass_code"][taken])
-        kept = np.flatnonzero(cluster >= 0)
-        kept = kept[radix_argsort(cluster[kept], np.arange(kept.size))]  # stable: in a cluster they stay by key
-        taken, cluster = taken[kept], cluster[kept]
     rows = {name: values[taken] for name, values in rows.items() if name in _FUSED}
+    if splitter:
+        split = splitter(rows["lon"], rows["lat"], cluster, rows["pass_code"])
+        if split is not cluster:
+            kept = np.flatnonzero(split >= 0)
+            kept = kept[radix_argsort(split[kept], np.arange(kept.size))]  # stable: in a cluster they stay by key
+            rows, cluster = {name: values[kept] for name, values in rows.items()}, split[kept]
     first = np.append(np.flatnonzero(np.diff(cluster, prepend=-1)), cluster.size)
     lead = first[:-1]
     weight = information_weights(rows["var_m2"]) if is_weighted else np.ones(cluster.size)
-    fused = fuse(rows["lon"], rows["lat"], weight=weight, pass_code=rows["pass_code"], first=first)
+    fused = fuse(
+        rows["lon"],
+        rows["lat"],
+        weight=weight,
+        pass_code=rows["pass_code"],
+        first=first,
+        ecef_m=rows.get("ecef_m"),
+    )
     if is_medoid is not None:
         fused = move_to_members(fused, rows["lon"][is_medoid[order]], rows["lat"][is_medoid[order]])
     class_code, confidence = vote(rows["class_code"], rows["class_confidence"], first)
@@ -161,12 +173,11 @@ def fuse_members(
     }
 
 
-def _key_order(track_id: Ints, pass_code: Ints, cluster: Ints) -> Ints:
-    """Return the order by cluster, pass and track."""
+def _key_order(track_id: Ints, pass_code: Ints) -> Ints:
+    """Return the order by pass and track."""
     if track_id.min() < 0:  # the radix sort takes no negative keys
-        return np.lexsort((track_id, pass_code, cluster))
-    order = radix_argsort(track_id, np.arange(track_id.size))
-    return radix_argsort(cluster, radix_argsort(pass_code, order))
+        return np.lexsort((track_id, pass_code))
+    return radix_argsort(pass_code, radix_argsort(track_id, np.arange(track_id.size)))
 
 
 def concatenate(parts: Sequence[Columns]) -> Columns:

