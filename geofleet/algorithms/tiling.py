@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 MAX_ZOOM = 23  # ST_QuadKey's
 MAX_LAT_DEG = math.degrees(math.atan(math.sinh(math.pi)))  # 85.0511: where Web Mercator is a square
 HALO_PER_EPS = 2.0
+FREE_PASSES = 50
 _HALF_TURN_DEG = 180.0
 _HALO_SLACK = 1.001  # the halo is measured by degrees, to 0.1 %
 
@@ -227,7 +228,7 @@ def split_chains(
     group = np.cumsum(is_first) - 1
     is_pass = is_first | np.append(True, np.diff(pass_code) != 0)
     n_passes = np.bincount(group[is_pass])
-    least = np.maximum(min_samples, np.ceil(share * n_passes)).astype(np.int64)
+    least = np.maximum(min_samples, np.ceil(share * np.maximum(n_passes - FREE_PASSES, 0))).astype(np.int64)
     again = least[group] > min_samples
     if not again.any():
         return cluster

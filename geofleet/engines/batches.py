@@ -175,7 +175,7 @@ def fuse_members(
 
 def _key_order(track_id: Ints, pass_code: Ints) -> Ints:
     """Return the order by pass and track."""
-    if track_id.min() < 0:  # the radix sort takes no negative keys
+    if track_id.min(initial=0) < 0:  # the radix sort takes no negative keys
         return np.lexsort((track_id, pass_code))
     return radix_argsort(pass_code, radix_argsort(track_id, np.arange(track_id.size)))
 

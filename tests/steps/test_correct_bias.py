@@ -8,6 +8,7 @@ import pytest
 import shapely
 
 from geofleet.algorithms.geodesy import EnuFrame
+from geofleet.algorithms.information import bias_posterior
 from geofleet.config import load_config
 from geofleet.errors import InputError
 from geofleet.steps.aggregate import aggregate
@@ -96,30 +97,31 @@ def place(tmp_path, table, passes=None):
 
 
 def in_numpy(table, frame, prior_sigma):
-    """Return positions in the frame and variances by the formulas of the estimator, pass by pass."""
+    """Return positions in the frame, variances and biases by the formulas of the estimator, pass by pass."""
     origin = frame.to_enu(table["info_lon"].to_numpy(), table["info_lat"].to_numpy())
     matrices = np.zeros((table.num_rows, 4, 4))
     matrices[:, *UPPER] = np.array(table["info_matrix"].to_pylist())
     matrices = matrices + np.triu(matrices, 1).swapaxes(1, 2)
     vectors = np.array(table["info_vector"].to_pylist())
     names = np.array(table["pass_id"].to_pylist())
-    xy, var = np.empty((table.num_rows, 2)), np.empty(table.num_rows)
+    xy, var, biases = np.empty((table.num_rows, 2)), np.empty(table.num_rows), []
     for name in np.unique(names):
         rows = np.flatnonzero(names == name)
-        left, right = np.diag(1 / np.square(prior_sigma)), np.zeros(2)
+        schur, right = np.zeros((2, 2)), np.zeros(2)
         for i in rows:
             n, r = matrices[i], vectors[i]
             inverse = np.linalg.inv(n[:2, :2])
-            left = left + n[2:, 2:] - n[2:, :2] @ inverse @ n[:2, 2:]
+            schur = schur + n[2:, 2:] - n[2:, :2] @ inverse @ n[:2, 2:]
             right = right + r[2:] - n[2:, :2] @ inverse @ r[:2]
-        cov = np.linalg.inv(left)
-        bias = cov @ right
+        bias, cov = bias_posterior(schur, right, np.array(prior_sigma))
+        biases.append([*bias, cov[0, 0], cov[0, 1], cov[1, 1]])
+        assert cov @ (np.diag(1 / np.square(prior_sigma)) + schur) == pytest.approx(np.eye(2), abs=1e-9)
         for i in rows:
             inverse = np.linalg.inv(matrices[i, :2, :2])
             gain = inverse @ matrices[i, :2, 2:]
             xy[i] = origin[i] + inverse @ (vectors[i, :2] - matrices[i, :2, 2:] @ bias)
             var[i] = np.trace(inverse + gain @ cov @ gain.T) / 2
-    return xy, var
+    return xy, var, np.array(biases)
 
 
 SIGNS_XY = np.array([(0.0, 5.0), (40.0, -6.0), (90.0, 4.0), (150.0, 5.0)])
@@ -133,7 +135,10 @@ def test_positions_and_variances_are_those_of_the_formulas(tmp_path, place_deg):
     table, _ = see(frame, SIGNS_XY, 6, noise=0.0)  # the residual is 0: no track is left out, nothing is scaled
     biases, placed, staged = place(tmp_path, table)
     table = table.sort_by([("pass_id", "ascending"), ("track_id", "ascending")])
-    xy, var = in_numpy(table, frame, (5.0, np.radians(5.0)))
+    xy, var, expected = in_numpy(table, frame, (5.0, np.radians(5.0)))
+    # the statement and the function that a vehicle and joint fusion use say the same
+    for column, name in enumerate(("range_bias_m", "bearing_bias_rad", "var_rr", "cov_rt", "var_tt")):
+        assert biases[name].to_numpy() == pytest.approx(expected[:, column], rel=1e-6, abs=1e-12)
     assert np.abs(frame.to_enu(placed["lon"].to_numpy(), placed["lat"].to_numpy()) - xy).max() < 1e-4
     assert placed["var_m2"].to_numpy() == pytest.approx(var, rel=1e-6)
     assert np.abs(placed["lon"].to_numpy()).max() <= 180

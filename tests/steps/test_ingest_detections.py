@@ -7,7 +7,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
+from scipy.spatial import cKDTree
+from sklearn.cluster import DBSCAN
 
+from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.config import load_config
 from geofleet.errors import InputError
 from geofleet.steps.aggregate import aggregate
@@ -109,3 +112,23 @@ def test_bremen_from_mapillary_to_a_layer_of_signs(shared_data, tmp_path):
     given, fused = detections["sign_class"].to_pylist(), signs.select(["sign_class", "n_detections"])
     per_class = fused.group_by("sign_class").aggregate([("n_detections", "sum")])
     assert dict(zip(*per_class.to_pydict().values(), strict=True)) == {c: given.count(c) for c in set(given)}
+    _demand_linked_groups(detections, signs, eps_m=config.aggregate.eps_m)
+
+
+def _demand_linked_groups(detections, signs, *, eps_m):
+    """Each sign stands where scikit-learn puts a group of as many, and no group is wider than its links allow."""
+    frame = EnuFrame.around(*lonlat(detections))
+    xy, classes = frame.to_enu(*lonlat(detections)), np.array(detections["sign_class"].to_pylist())
+    places, named = frame.to_enu(*lonlat(signs)), np.array(signs["sign_class"].to_pylist())
+    sizes = signs["n_detections"].to_numpy()
+    for name in np.unique(classes):
+        points, mine = xy[classes == name], named == name
+        labels = DBSCAN(eps=eps_m, min_samples=1).fit_predict(points)
+        counts = np.bincount(labels)
+        centres = np.column_stack([np.bincount(labels, side) / counts for side in points.T])
+        for label in np.flatnonzero(counts > 1):
+            assert np.ptp(points[labels == label], axis=0).max() <= eps_m * (counts[label] - 1)
+        distance_m, nearest = cKDTree(centres).query(places[mine])
+        assert distance_m.max() < 1e-3
+        assert sorted(nearest.tolist()) == list(range(len(counts)))
+        assert (sizes[mine] == counts[nearest]).all()
