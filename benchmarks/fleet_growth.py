@@ -26,9 +26,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="paper")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--sizes", nargs="+", type=int, default=[20, 50, 200, 2000])
-    parser.add_argument("--shares", nargs="+", type=float, default=[0.0, 0.05, 0.1])
+    parser.add_argument("--sizes", nargs="+", type=int, default=[20, 50, 100, 200, 2000])
+    parser.add_argument("--shares", nargs="+", type=float, default=[0.0, 0.2, 0.35, 0.5])
     parser.add_argument("--replicates", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=Path, default=RAW / "helsinki_derived.pos")
     args = parser.parse_args()
     with TemporaryDirectory() as name:
@@ -42,7 +43,7 @@ def main() -> None:
             config=config,
             n_vehicles=max(args.sizes),
             n_replicates=args.replicates,
-            seed=0,
+            seed=args.seed,
         )
         print("vehicles  share     F1    tp    fp    fn  GOSPA_M")
         for size in args.sizes:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 MAX_ZOOM = 23  # ST_QuadKey's
 MAX_LAT_DEG = math.degrees(math.atan(math.sinh(math.pi)))  # 85.0511: where Web Mercator is a square
 HALO_PER_EPS = 2.0
-FREE_PASSES = 50
+FREE_PASSES = 50  # of a cluster: its core rule does not follow these
 _HALF_TURN_DEG = 180.0
 _HALO_SLACK = 1.001  # the halo is measured by degrees, to 0.1 %
 
@@ -205,9 +205,11 @@ def split_chains(
     """Cluster the members of each cluster anew with a core rule that follows the passes behind it.
 
     The more passes, the more far-out detections: with a fixed core rule three of them bridge two signs of a class, and
-    clusters grow into chains as fleets do. A sign that many passes report has a core of many. So a cluster of P passes
-    is clustered again, by itself, with max(min_samples, share P) for a core; what is left over is noise. A cluster is
-    known whole by then, so that tiles do not show in this either.
+    clusters grow into chains as fleets do. A sign has a place that most of its passes agree on within eps; what lies
+    between two signs has not. So a cluster of P passes is clustered again, by itself, with
+    max(min_samples, share (P - 50)) for a core; what is left over is noise. The first fifty passes are free: a count of
+    so few says little, and the rule sets in without a step. A cluster is known whole by then, so that tiles do not
+    show in this either.
 
     Parameters
     ----------
@@ -218,7 +220,7 @@ def split_chains(
     eps_m, min_samples
         Those of the clusters.
     share
-        Passes of a cluster that make a core, 0 … 1.
+        Share of the passes of a cluster beyond `FREE_PASSES` that make a core, 0 … 1.
 
     Returns
     -------

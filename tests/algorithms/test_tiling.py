@@ -259,13 +259,13 @@ def test_a_core_rule_that_follows_the_passes_splits_what_a_fixed_one_chains():
     assert set(split.tolist()) - {-1} == {1, 2}
     for label in (1, 2):
         assert len(set((xy[split == label, 0] > 6.5).tolist())) == 1  # all of it on one side
-    expected = dbscan(xy, 4.0, 300)  # half of 600 passes
+    expected = dbscan(xy, 4.0, 275)  # half of the 550 passes beyond the first fifty
     assert ((split < 0) == (expected < 0)).all()
     assert len(np.unique(np.column_stack((split, expected)), axis=0)) == len(np.unique(split))
 
 
 def test_few_passes_leave_clusters_as_they_are():
-    _, lon, lat, pass_code = chain(np.random.default_rng(0), 20)
-    clusters = np.repeat([4, 9], 20)
-    same = split_chains(lon, lat, clusters, pass_code, eps_m=4.0, min_samples=3, share=0.1)
-    assert same is clusters
+    _, lon, lat, pass_code = chain(np.random.default_rng(0), 56)  # 3 is half of those beyond fifty
+    clusters = np.full(2 * 56, 4)
+    assert split_chains(lon, lat, clusters, pass_code, eps_m=4.0, min_samples=3, share=0.5) is clusters
+    assert split_chains(lon, lat, clusters, pass_code, eps_m=4.0, min_samples=2, share=0.5) is not clusters
