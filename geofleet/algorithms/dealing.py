@@ -96,7 +96,7 @@ def _find(slots: Ints, key: int) -> int:
     slot = _slot(key, mask)
     while slots[slot, 0] != key and slots[slot, 0] != _EMPTY:
         slot = (slot + 1) & mask
-    return slots[slot, 1]
+    return int(slots[slot, 1])
 
 
 @njit(cache=True, nogil=True)

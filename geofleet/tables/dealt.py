@@ -80,7 +80,7 @@ class Dealer:
         take_rows(self._dealt, row, reader, start, self._readers, *kinds)
         for number in np.flatnonzero(np.diff(start)).tolist():
             with batch_path(self._folder, number).open("ab") as file:
-                file.write(self._dealt[start[number] : start[number + 1]].view(np.uint8))
+                file.write(self._dealt[start[number] : start[number + 1]].view(np.uint8).data)
 
 
 def batch_path(folder: Path, number: int) -> Path:
