@@ -232,10 +232,11 @@ def name_hashes(hashes: NDArray[np.uint64]) -> NDArray[np.bytes_]:
         (n,) in the order of their first 48 bits.
     """
     number = hashes.astype(np.uint64) >> ID_SHIFT
-    shifts = np.arange(4 * (_HASH_DIGITS - 1), -1, -4, dtype=np.uint64)
+    digits = np.frombuffer(b"0123456789abcdef", np.uint8)
     letters = np.empty((number.size, 1 + _HASH_DIGITS), np.uint8)
     letters[:, 0] = ord("f")
-    letters[:, 1:] = np.frombuffer(b"0123456789abcdef", np.uint8)[(number[:, None] >> shifts) & np.uint64(15)]
+    for digit in range(_HASH_DIGITS):  # one at a time: all at once would hold a hundred bytes an id
+        letters[:, 1 + digit] = digits[(number >> np.uint64(4 * (_HASH_DIGITS - 1 - digit))) & np.uint64(15)]
     names = letters.reshape(-1).view(f"S{1 + _HASH_DIGITS}")
     repeated = np.flatnonzero(np.diff(number, prepend=number[:1] ^ np.uint64(1)) == 0)
     if repeated.size:

@@ -37,6 +37,11 @@ _FUSED = frozenset(
 )  # what a sign is made from
 
 
+_OPEN = (_FUSED - {"ecef_m"}) | {
+    "is_owned"
+}  # what is kept until all batches are done; places are cheaper to compute again
+
+
 @dataclass(frozen=True, slots=True)
 class TileTask:
     """A batch of tiles: plain data, so that it can be sent anywhere."""
@@ -77,7 +82,7 @@ def cluster_batch(task: TileTask) -> TileResult:
         min_samples=task.min_samples,
         ecef_m=rows["ecef_m"],
     )
-    open_rows = {name: values[found.open_row] for name, values in rows.items()}
+    open_rows = {name: rows[name][found.open_row] for name in _OPEN}
     open_rows |= {"cluster": found.open_cluster, "is_core": found.open_is_core}
     return TileResult(fuse_members(rows, found.closed_row, found.closed_cluster, splitter=splitter(task)), open_rows)
 
@@ -88,14 +93,13 @@ def splitter(task: TileTask) -> Splitter:
 
 
 def fuse_open(parts: Sequence[Columns], split: Splitter | None = None) -> Columns:
-    """Join the open clusters of all batches, split chains as in closed ones, and fuse them."""
+    """Join the open clusters of all batches, taking their rows out of the parts, split chains and fuse them."""
     n_before = 0
-    numbered = []
-    for part in parts:
-        # a cluster belongs to one tile, and clusters are numbered within a batch
-        numbered.append(part | {"cluster": part["cluster"] + n_before})
-        n_before += int(part["cluster"].max(initial=-1)) + 1
-    rows = concatenate(numbered)
+    for part in parts:  # a cluster belongs to one tile, and clusters are numbered within a batch
+        n_found = int(part["cluster"].max(initial=-1)) + 1
+        part["cluster"] += n_before
+        n_before += n_found
+    rows = concatenate(parts)
     if not rows:
         return {}
     order = _key_order(rows["track_id"], rows["pass_code"])

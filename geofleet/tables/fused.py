@@ -70,10 +70,14 @@ def layer_pieces(clusters: Columns, support: NDArray[np.float64], labels: Labels
         yield SIGNS.arrow(_FUSED).empty_table()
         return
     order = _by_name(clusters, np.flatnonzero(clusters["n_passes"] >= support))
-    names = name_hashes(clusters["hash"][order])
+    hashes = clusters["hash"][order]
+    numbers = hashes >> ID_SHIFT
+    # Only ids that collide, one pair in 2⁴⁸, must be known all together.
+    names = name_hashes(hashes) if (numbers[1:] == numbers[:-1]).any() else None
     for begin in range(0, max(len(order), 1), PIECE_ROWS):
         piece = slice(begin, begin + PIECE_ROWS)
-        yield _piece({name: values[order[piece]] for name, values in clusters.items()}, names[piece], labels)
+        kept = {name: values[order[piece]] for name, values in clusters.items()}
+        yield _piece(kept, name_hashes(hashes[piece]) if names is None else names[piece], labels)
 
 
 def _by_name(clusters: Columns, rows: Ints) -> Ints:

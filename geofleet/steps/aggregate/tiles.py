@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
 
 BATCH_ROWS = 100_000  # detections that one thread clusters at a time: tens of megabytes
+COARSEST_ZOOM, COARSER_BY = (
+    12,
+    2,
+)  # where detections are sparse, tiles are four times as wide as asked for: fewer borders
 DUCKDB_MEMORY = "250MB"  # what its joins and groups may hold before they spill
 
 
@@ -45,7 +49,7 @@ def stage(
             connection,
             detections,
             folder,
-            zoom=settings.tile_zoom,
+            zoom=max(COARSEST_ZOOM, settings.tile_zoom - COARSER_BY),
             halo_m=halo_m(settings.eps_m) if settings.method == "dbscan" else 0.0,
             batch_rows=BATCH_ROWS,
             n_vehicles=n_vehicles or 0,
