@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from derive_map_drive import derive
 
+from geofleet.cli.output import progress_bar
 from geofleet.config import load_config
 from geofleet.formats.study_figures import draw_curves, figure_file
 from geofleet.workflows.study.compare import BARS, describe
@@ -114,7 +115,8 @@ def main() -> None:
     for name, make, by in (("environments", environments, "place"), ("mixed-fleets", mixed_fleets, "setting")):
         worlds = make(args.out / "inputs")
         study = Study(worlds, methods, SIZES, args.replicates, args.seed, in_view=True)
-        rows = run_study(study, args.out, n_workers=args.workers)
+        with progress_bar(name) as progress:
+            rows = run_study(study, args.out, n_workers=args.workers, progress=progress)
         caption = describe(study)
         write_study(
             *(name, study, rows, args.out),

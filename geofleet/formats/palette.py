@@ -10,8 +10,8 @@ BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#999999"
 LIGHT_GREY = "#D0D0D0"
 
-# Where something is drawn beside others of its kind, e.g. a method of several.
-SERIES = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY_BLUE, BLACK)
+# Where something is drawn beside others of its kind, e.g. a method of several; black is what the paper printed.
+SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE, GREY)
 
 # GOSPA_M in metres, each class up to and without its bound.
 GOSPA_M_CLASSES = (

@@ -6,6 +6,8 @@ from contextlib import contextmanager
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
+from geofleet.formats.palette import BLACK, SERIES
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
@@ -15,8 +17,6 @@ if TYPE_CHECKING:
 
     Rows = Sequence[Mapping[str, Any]]
 
-# Okabe and Ito's colours.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 3)))
 NAMES = {
@@ -81,7 +81,7 @@ def draw_curves(
         What the legend calls the groups.
     """
     names = list(dict.fromkeys(row[by] for row in summary))
-    for name, colour, mark, dash in zip(names, cycle(COLOURS), cycle(MARKS), cycle(DASHES), strict=False):
+    for name, colour, mark, dash in zip(names, cycle(SERIES), cycle(MARKS), cycle(DASHES), strict=False):
         rows = [r for r in summary if r[by] == name and score in {None, r["score"]} and r["mean"] is not None]
         x, mean = [row[across] for row in rows], [row["mean"] for row in rows]
         sd = [row["sd"] or 0.0 for row in rows]
@@ -104,7 +104,7 @@ def draw_curves(
 
 
 def draw_paper(
-    axes: Axes, points: Sequence[tuple[float, float, float | None]], *, label: str, colour: str = "#000000"
+    axes: Axes, points: Sequence[tuple[float, float, float | None]], *, label: str, colour: str = BLACK
 ) -> None:
     """Draw points of the paper: x, mean, and standard deviation where it has one."""
     if points:

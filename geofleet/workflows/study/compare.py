@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from geofleet.formats.study_figures import COLOURS, NAMES, draw_curves, draw_paper, figure_file
+from geofleet.formats.palette import BLACK, SERIES
+from geofleet.formats.study_figures import NAMES, draw_curves, draw_paper, figure_file
 from geofleet.workflows.study.methods import CORRECTED, JOINT, TABLE_2, default_methods
 from geofleet.workflows.study.paper import paper_curve, paper_table
 from geofleet.workflows.study.results import GROUP, find, write_study
@@ -142,7 +143,7 @@ def _draw_sweep(path: Path, summary: Rows, caption: str) -> None:
         upper, lower = figure.subplots(2, 1, sharex=True)
         for axes, score in ((upper, "f1"), (lower, "gospa_m")):
             draw_curves(axes, values, score=score, across="value")
-            for method, colour in zip(dict.fromkeys(row["method"] for row in values), COLOURS, strict=False):
+            for method, colour in zip(dict.fromkeys(row["method"] for row in values), SERIES, strict=False):
                 if method in paper_table():
                     axes.axhline(paper_table()[method][score], color=colour, linestyle=":", linewidth=1)
         lower.set(xlabel=key, ylim=(0, None))
@@ -169,10 +170,10 @@ def _draw_dots(axes: Axes, rows: Rows, methods: list[str], score: str) -> None:
     where = [methods.index(row["method"]) for row in ours]
     mean = [row["mean"] for row in ours]
     axes.errorbar(
-        mean, where, xerr=[row["sd"] or 0.0 for row in ours], fmt="o", color=COLOURS[0], capsize=2, label="geofleet"
+        mean, where, xerr=[row["sd"] or 0.0 for row in ours], fmt="o", color=SERIES[0], capsize=2, label="geofleet"
     )
     printed = [(methods.index(name), scores[score]) for name, scores in paper_table().items() if name in methods]
     if printed and rows[0]["n_vehicles"] == 50:  # noqa: PLR2004 (the fleet of Table 2)
         place, value = zip(*printed, strict=True)
-        axes.plot(value, place, "x", color="#000000", label="the paper")
+        axes.plot(value, place, "x", color=BLACK, label="the paper")
     axes.set_xlabel(NAMES[score])

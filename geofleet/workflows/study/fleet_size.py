@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from geofleet.formats.study_figures import COLOURS, NAMES, draw_curves, draw_paper, figure_file
+from geofleet.formats.palette import SERIES
+from geofleet.formats.study_figures import NAMES, draw_curves, draw_paper, figure_file
 from geofleet.workflows.study.compare import BARS, describe
 from geofleet.workflows.study.methods import CORRECTED, JOINT, default_methods
 from geofleet.workflows.study.paper import paper_curve
@@ -106,7 +107,7 @@ def draw_figures(folder: Path, summary: Rows, caption: str) -> None:
     with figure_file(folder / "figure-4-counts", caption=f"{caption}\n{BARS} Crosses: the paper.") as figure:
         axes = figure.subplots()
         draw_curves(axes, counts, score=None, by="of")
-        for score, colour in zip(("tp", "fp", "fn"), COLOURS, strict=False):
+        for score, colour in zip(("tp", "fp", "fn"), SERIES, strict=False):
             points = [(p.n_vehicles, p.mean, p.sd) for p in paper_curve(score)]
             draw_paper(axes, points, label="", colour=colour)
         axes.set(xlabel="vehicles", ylabel=f"signs, {own[0]['method']}", ylim=(0, None))
