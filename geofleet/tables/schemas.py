@@ -388,6 +388,9 @@ STUDY_SCORES = Schema(
 SCHEMAS = MappingProxyType(
     {
         s.name: s
-        for s in (SIGNS, RUNS, REFERENCE, LANES, DRIVES, PASSES, DETECTIONS, TRUTH, MATCHES, SCORES, STUDY_SCORES)
+        for s in (
+            *(SIGNS, RUNS, REFERENCE, LANES, DRIVES, PASSES, DETECTIONS, TRUTH),
+            *(EVIDENCE, NUISANCE, MATCHES, SCORES, STUDY_SCORES),
+        )
     }
 )

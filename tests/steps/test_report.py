@@ -157,6 +157,9 @@ def test_an_empty_map_still_has_a_report(small, tmp_path, make_signs):
     evaluate(tmp_path / "map.parquet", small / "reference.parquet", tmp_path / "evaluation", config=load_config())
     page = report(tmp_path, tmp_path / "report").files[0].read_text(encoding="utf-8")
     assert "no error to show" in page
+    assert "<h1>Empty sign map</h1>" in page
+    assert "method none" not in page
+    assert "GOSPA_M has no interval" in page
     assert read_contents(tmp_path).shown["null_reason"] in page.replace("&#39;", "'")
 
 
@@ -192,6 +195,19 @@ def test_of_several_maps_the_median_of_the_largest_fleet_is_drawn(tmp_path, make
     page = report(tmp_path, tmp_path / "report").files[0].read_text(encoding="utf-8")
     assert "curve_gospa_m" in page  # method a was scored with two fleet sizes
     assert (tmp_path / "report" / "figures" / "fleet_size_gospa_m.svg").is_file()
+
+
+def test_intervals_of_several_runs_are_not_passed_off_as_those_of_the_run_drawn(tmp_path, make_signs):
+    """One, two and three of four signs are found: the median run has F1 2/3, their mean is (0.4 + 2/3 + 6/7) / 3."""
+    places = [(0, 0), (50, 0), (100, 0), (150, 0)]
+    found, runs = [places[k] for n in (1, 2, 3) for k in range(n)], [f"r{n}" for n in (1, 2, 3) for _ in range(n)]
+    columns = {"run_id": runs, "method": ["m"] * 6, "n_vehicles": [5] * 6}
+    write_table(SIGNS, make_signs(found, ["stop"] * 6, **columns), tmp_path / "map.parquet")
+    write_table(SIGNS, make_signs(places, ["stop"] * 4), tmp_path / "reference.parquet")
+    evaluate(tmp_path / "map.parquet", tmp_path / "reference.parquet", tmp_path / "evaluation", config=load_config())
+    page = report(tmp_path, tmp_path / "report").files[0].read_text(encoding="utf-8")
+    assert "<b>0.667</b><span>mean of 3 runs 0.641, 95 %:" in page
+    assert "of 3 runs the one with the median GOSPA_M" in page
 
 
 def test_curves_of_a_study_stand_beside_the_papers_points(small, tmp_path):

@@ -88,6 +88,8 @@ def title(contents: Contents) -> str:
     """Name the map and its fleet."""
     shown, run = contents.shown, contents.run
     size = shown["n_vehicles"]
+    if _is_empty(contents):
+        return "Empty sign map"
     if run is not None:
         return f"Sign map of {size} simulated vehicles"
     return f"Sign map of {size} vehicles" if size else "Sign map"
@@ -96,13 +98,18 @@ def title(contents: Contents) -> str:
 def subtitle(contents: Contents) -> str:
     """Say how the map was made and what it was scored against."""
     shown, run = contents.shown, contents.run
-    parts = [f"method {shown['method']}"]
+    parts = [] if _is_empty(contents) else [f"method {shown['method']}"]
     if run is not None:
         parts.append(f"scenario {run['scenario']}, tracker {run['tracker']}, upload {run['upload']}")
     n = shown["tp"] + shown["fn"]
     sources = sorted(set(contents.reference.get("source", ())))
     parts.append(f"scored against {n} signs" + (f" of {', '.join(sources[:3])}" if sources else ""))
     return " · ".join(parts)
+
+
+def _is_empty(contents: Contents) -> bool:
+    """Tell whether the map has no sign: it then knows neither its method nor its fleet."""
+    return not (contents.shown["tp"] or contents.shown["fp"])
 
 
 def _badges(contents: Contents) -> list[dict[str, Any]]:
@@ -118,16 +125,28 @@ def _badges(contents: Contents) -> list[dict[str, Any]]:
 def _cards(contents: Contents) -> list[dict[str, str]]:
     """Return a card a score, with its interval, and one of the counts."""
     shown = contents.shown
-    intervals = {row["score"]: row for row in contents.intervals if row["low"]}
     cards = []
     for name, label, unit in _CARDS:
-        interval = intervals.get(name)
+        interval = _interval(contents, name)
         note = f"95 %: {float(interval['low']):.2f} to {float(interval['high']):.2f}" if interval else "no interval"
+        if interval and _n_runs(contents) > 1:  # the score is that of the run drawn, the interval that of all runs
+            note = f"mean of {_n_runs(contents)} runs {float(interval['estimate']):.3f}, {note}"
         if shown[name] is None:
             note = shown["null_reason"] or ""
         cards.append({"name": label, "value": _number(shown[name], 3), "unit": unit, "note": note})
     counts = f"{shown['tp']} / {shown['fp']} / {shown['fn']}"
     return [*cards, {"name": "TP / FP / FN", "value": counts, "unit": "", "note": "found / false / missed signs"}]
+
+
+def _n_runs(contents: Contents) -> int:
+    """Return how many runs of the map's method and fleet size were scored."""
+    labels = [(total["method"], total["n_vehicles"]) for total in contents.totals]
+    return labels.count((contents.shown["method"], contents.shown["n_vehicles"]))
+
+
+def _interval(contents: Contents, score: str) -> Mapping[str, Any] | None:
+    """Return the first interval that a score has."""
+    return next((row for row in contents.intervals if row["score"] == score and row["low"]), None)
 
 
 def _score_note(contents: Contents) -> str:
@@ -137,9 +156,11 @@ def _score_note(contents: Contents) -> str:
         f"GOSPA_M = √(MSE_M + c²/2 · (FN + FP) / TP) with c = {_plain(shown['gate_m'])} m: 0 for a perfect map, "
         f"smaller is better. A match is nearer than c and agrees in {_MATCH_ON[shown['match_on']]}. "
     )
-    interval = next((row for row in contents.intervals if row["score"] == "gospa_m" and row["low"]), None)
+    if _n_runs(contents) > 1:
+        first += f"The scores are those of the map drawn, of {_n_runs(contents)} runs the one with the median GOSPA_M. "
+    interval = _interval(contents, "gospa_m")
     if interval is None:
-        return first + "There is no interval: see intervals.csv."
+        return first + "GOSPA_M has no interval: intervals.csv says why."
     estimand = interval["estimand"].replace("gospa_m", "score")
     note = f" Beware: {interval['note']}." if interval["note"] else ""
     return f"{first}Intervals are for {estimand} ({interval['interval_method']}).{note}"
