@@ -3,9 +3,11 @@
 A sign is the sum of its tracks: Λ = Σ W and η = Σ W z of their places, and the log-likelihood of every class. A sweep
 takes each pass out of the map, assigns its tracks anew and puts it back. A track joins a sign at the cost
 
-    ½ m² + ½ log |2πS| - log Σ_k π_k M[k, c]        with S the covariance of their difference, c the class read
+    ½ m² + ½ log |2πS| - log Σ_k π_k M[k, c] - log (n + 1) / (n̄ + 1)
 
-or begins a new one at -log(λ / n_classes). Two tracks of a pass that share a frame are two signs; tracks that never
+with S the covariance of their difference, c the class read, n the tracks that the sign has and n̄ the passes around that
+report it not: a sign that every pass reports would be missed by this one, and a chance neighbour of it would not. Or it
+begins a new one at -log(λ / n_classes). Two tracks of a pass that share a frame are two signs; tracks that never
 share one may be one. Assignment is exact within every pass (`assignment`), and coordinate descent over the passes.
 """
 
@@ -40,6 +42,7 @@ class Places(NamedTuple):
     frame_first: Ints
     frame_last: Ints
     first: Ints  # (n_passes + 1,)
+    n_around: Ints  # (n,) passes that report anything around the track; 0 where that tells nothing
 
 
 class Signs(NamedTuple):
@@ -64,7 +67,7 @@ class _Grid(NamedTuple):
 
 def sweep(
     places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, *, birth_cost: float
-) -> tuple[Ints, int]:
+) -> Ints:
     """Assign every pass anew against all others.
 
     Parameters
@@ -82,18 +85,17 @@ def sweep(
 
     Returns
     -------
-    (n,) sign of each track, numbered from 0 by their first track, and how many tracks changed.
+    (n,) sign of each track, numbered from 0 by their first track.
     """
     grid = _grid(places.xy_m)
     found: Ints = _sweep(places, sign.copy(), log_confusion, log_prior, birth_cost, grid)
     numbered = np.unique(found, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(numbered[1], kind="stable"), kind="stable")
     signs: Ints = rank[numbered[2]].astype(np.int64)
-    before, after = _leaders(sign), _leaders(signs)
-    return signs, int(np.count_nonzero(before != after))
+    return signs
 
 
-def _leaders(sign: Ints) -> Ints:
+def leaders(sign: Ints) -> Ints:
     """Return the first track of each track's sign: a name that does not depend on numbering."""
     lead = np.arange(len(sign))
     known = sign >= 0
@@ -342,7 +344,16 @@ def _cost(places: Places, signs: Signs, i: int, k: int, log_confusion: Floats, l
         return np.inf
     read = log_confusion[places.kind_code[i], :, places.class_code[i]]
     spatial = 0.5 * chi2 + np.log(2 * np.pi) + 0.5 * np.log(det)
-    return float(spatial + class_cost(signs.log_class[k], log_prior, read))
+    usual = _usual(places.n_around[i], signs.n_tracks[k])
+    return float(spatial + class_cost(signs.log_class[k], log_prior, read) - usual)
+
+
+@njit(cache=True, nogil=True)
+def _usual(n_around: int, n_tracks: int) -> float:
+    """Return the log-odds that a pass around reports a sign of so many tracks: Laplace's rule, of the other passes."""
+    if n_around == 0:
+        return 0.0
+    return float(np.log((n_tracks + 1) / (max(n_around - 1 - n_tracks, 0) + 1)))
 
 
 @njit(cache=True, nogil=True)

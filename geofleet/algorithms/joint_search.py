@@ -9,7 +9,7 @@ import numpy as np
 
 from geofleet.algorithms import joint_evidence as evidence
 from geofleet.algorithms.joint_alignment import align_passes
-from geofleet.algorithms.joint_association import NO_SIGN, Places, sweep
+from geofleet.algorithms.joint_association import NO_SIGN, REACH_M, Places, leaders, sweep
 from geofleet.algorithms.joint_merging import merge
 from geofleet.algorithms.joint_solution import solve
 from geofleet.algorithms.joint_tracks import Passes, Tracks, pass_biases, places, with_jitter
@@ -32,6 +32,8 @@ that differs."""
 FLEET_JITTER_M = 0.05
 PASS_JITTER_COST = 3.0
 """Nats that a pass must gain to have a jitter of its own."""
+FREE_ROUNDS, JITTER_INERTIA = 4, 1.0
+"""After so many rounds a pass keeps its jitter unless it gains so many nats by another."""
 
 
 PRIOR_SHIFT_M = (0.1, 1.0)
@@ -107,6 +109,7 @@ class Search:
         self.xy_m = np.zeros((0, 2))
         self.at, self.at_cov = np.zeros((len(self.sign), 4)), np.zeros((len(self.sign), 4, 4))
         self.weighted = tracks
+        self.n_around = np.zeros(len(self.sign), np.int64)
         self.n_rounds, self.is_settled = 0, False
 
     def run(self) -> None:
@@ -123,9 +126,11 @@ class Search:
             if is_firm and changed == 0 and moved < SETTLED_M:
                 self.is_settled = True
                 return
-            if is_firm and changed and self.sign.tobytes() in seen:
+            state = self.sign.tobytes() + self.jitter.tobytes()
+            if is_firm and changed and state in seen:
                 return  # it goes in circles: two associations that are as good as each other
-            seen.add(self.sign.tobytes())
+            if is_firm:
+                seen.add(state)
             if self.n_rounds >= len(LOOSE_M):
                 self.learn()
 
@@ -153,6 +158,8 @@ class Search:
         all_cov[:, 2:, 2:] = bias_cov
         self.at = self.nuisance[self.tracks.pass_code]
         self.at_cov = all_cov[self.tracks.pass_code]
+        # a pass of a single track drove who knows where: not seeing a sign tells nothing of it
+        self.n_around[rows] = _passes_around(self.placed(self.weighted)[0][rows], self.tracks.pass_code[rows])
 
     def placed(self, tracks: Tracks) -> tuple[Floats, Floats]:
         """Return where tracks are, offset and bias of their pass taken out as its other tracks know them."""
@@ -173,6 +180,7 @@ class Search:
             self.tracks.frame_first,
             self.tracks.frame_last,
             self.first,
+            self.n_around,
         )
 
     def associate(self) -> int:
@@ -181,12 +189,11 @@ class Search:
         here = self.places(loose_m)
         confusion = self.read.log_confusion
         before = self.sign
-        found, changed = sweep(here, before, confusion, self.log_prior, birth_cost=self.birth_cost)
+        found = sweep(here, before, confusion, self.log_prior, birth_cost=self.birth_cost)
         if self.n_rounds == 1:
-            found, _ = sweep(here, found, confusion, self.log_prior, birth_cost=self.birth_cost)
-        joined = merge(here, found, confusion, self.log_prior, birth_cost=self.birth_cost)
-        self.sign = joined
-        return changed + int(found.max() - joined.max())
+            found = sweep(here, found, confusion, self.log_prior, birth_cost=self.birth_cost)
+        self.sign = merge(here, found, confusion, self.log_prior, birth_cost=self.birth_cost)
+        return int(np.count_nonzero(leaders(before) != leaders(self.sign)))
 
     def solve(self) -> float:
         """Solve for signs and passes; return how far the signs of before have moved at most."""
@@ -241,8 +248,13 @@ class Search:
             gain[:, at] = np.bincount(code, -0.5 * (np.log(det) + chi2), minlength=len(gain))
         fleet = int(np.argmax(gain.sum(axis=0)))
         own = np.argmax(gain, axis=1)
-        differs = gain[np.arange(len(gain)), own] > gain[:, fleet] + PASS_JITTER_COST
-        jitter: Floats = JITTERS_M[np.where(differs, own, fleet)]
+        every = np.arange(len(gain))
+        differs = gain[every, own] > gain[:, fleet] + PASS_JITTER_COST
+        chosen = np.where(differs, own, fleet)
+        # what is as good as before stays as before: the errors that it is chosen by depend on it
+        before = np.searchsorted(JITTERS_M, self.jitter)
+        stays = gain[every, chosen] < gain[every, before] + JITTER_INERTIA
+        jitter: Floats = JITTERS_M[np.where(stays & (self.n_rounds > FREE_ROUNDS), before, chosen)]
         jitter[self.n_fleet :] = 0.0
         return jitter
 
@@ -285,6 +297,22 @@ class Search:
         """Solve with this standard deviation of the translation of the prior map."""
         passes = replace(self.passes, gnss_sigma_m=np.append(self.passes.gnss_sigma_m[:-1], sigma_m))
         return solve(self.weighted, passes, self.sign, n_signs, self.nuisance, with_cov=True, marginal_of=self.n_fleet)
+
+
+def _passes_around(xy_m: Floats, pass_code: Ints) -> Ints:
+    """Return how many passes have a track in the cell of each track or in one beside it, (n,); cells of `REACH_M`."""
+    if not len(xy_m):
+        return np.zeros(0, np.int64)
+    cell = np.floor((xy_m - xy_m.min(axis=0)) / REACH_M).astype(np.int64) + 1
+    width = int(cell[:, 0].max()) + 2
+    n_passes = int(pass_code.max()) + 1
+    key = cell[:, 1] * width + cell[:, 0]
+    taken = np.unique(key * n_passes + pass_code)  # passes of each cell, once
+    steps = np.array([row * width + column for row in (-1, 0, 1) for column in (-1, 0, 1)])
+    spread = np.unique((taken // n_passes + steps[:, None]) * n_passes + taken % n_passes)
+    cells, count = np.unique(spread // n_passes, return_counts=True)
+    around: Ints = count[np.searchsorted(cells, key)]
+    return around
 
 
 def _share_of_tight(wide: Solution, sigmas_m: tuple[float, float]) -> float:
