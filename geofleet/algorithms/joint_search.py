@@ -38,8 +38,10 @@ FREE_ROUNDS, JITTER_INERTIA = 4, 1.0
 
 PRIOR_SHIFT_M = (0.1, 1.0)
 """Standard deviation an axis of the translation of a prior map as a whole: as a rule, and when it is off."""
-PRIOR_IS_OFF = 0.2
+PRIOR_IS_OFF = 0.5
 """Probability beforehand that it is off."""
+LEFT_OUT = 0.1
+"""What a 90 % ellipse leaves out: up to so much the other translation need not lie in it."""
 AS_READ = 1e-6
 """Share of misread tracks where nothing can show one."""
 PRIOR_RETYPED = 0.1
@@ -278,20 +280,20 @@ class Search:
         return plain_xy_m[used] - others, plain_cov[used] + others_cov, code[used]
 
     def final(self) -> Solution:
-        """Solve with covariances; a prior map weighs both of its priors by what the fleet says of its translation."""
+        """Solve with covariances; of both priors of a prior map's translation by the one that the fleet makes likelier.
+
+        A mean of both would be far from either. The covariance holds for the other one too, unless that is unlikely.
+        """
         n_signs = int(self.sign.max(initial=-1)) + 1
         if not self.has_prior or n_signs == 0:
             return solve(self.weighted, self.passes, self.sign, n_signs, self.nuisance, with_cov=n_signs > 0)
         tight, wide = (self._solved_with_prior(sigma_m, n_signs) for sigma_m in PRIOR_SHIFT_M)
         share = _share_of_tight(wide, PRIOR_SHIFT_M)
-
-        def mix(name: str) -> Floats:
-            mixed: Floats = share * getattr(tight, name) + (1 - share) * getattr(wide, name)
-            return mixed
-
+        likelier, other_share = (tight, 1 - share) if share >= 1 / 2 else (wide, share)
         apart = tight.xy_m - wide.xy_m
-        between = share * (1 - share) * apart[:, :, None] * apart[:, None, :]
-        return replace(tight, xy_m=mix("xy_m"), cov_m2=mix("cov_m2") + between, nuisance=mix("nuisance"))
+        wide_cov = wide.cov_m2 + apart[:, :, None] * apart[:, None, :]
+        weight = min(1.0, other_share / LEFT_OUT)
+        return replace(likelier, cov_m2=(1 - weight) * likelier.cov_m2 + weight * wide_cov)
 
     def _solved_with_prior(self, sigma_m: float, n_signs: int) -> Solution:
         """Solve with this standard deviation of the translation of the prior map."""
@@ -319,13 +321,13 @@ def _share_of_tight(wide: Solution, sigmas_m: tuple[float, float]) -> float:
     """Return the posterior of the tight prior of a map's translation, from the solution under the wide one."""
     if wide.marginal_cov is None:
         raise ValueError("the solution lacks the marginal covariance of the prior map")
-    cov = wide.marginal_cov[:2, :2]
-    likely_cov = np.linalg.inv(np.linalg.inv(cov) - np.eye(2) / sigmas_m[1] ** 2)  # what the fleet alone says
-    shift = likely_cov @ np.linalg.solve(cov, wide.nuisance[-1, :2])
+    precision = np.asarray(np.linalg.inv(wide.marginal_cov[:2, :2]), np.float64)
+    said = precision @ wide.nuisance[-1, :2]
+    of_fleet = precision - np.eye(2) / sigmas_m[1] ** 2  # nothing where no sign of the map is reported
     log_evidence = []
     for sigma_m in sigmas_m:
-        s = likely_cov + sigma_m**2 * np.eye(2)
-        log_evidence.append(-0.5 * (np.log(np.linalg.det(s)) + shift @ np.linalg.solve(s, shift)))
+        spread = np.linalg.det(np.eye(2) + sigma_m**2 * of_fleet)
+        log_evidence.append(0.5 * (said @ np.linalg.solve(of_fleet + np.eye(2) / sigma_m**2, said) - np.log(spread)))
     odds = PRIOR_IS_OFF / (1 - PRIOR_IS_OFF)
     return float(1 / (1 + odds * np.exp(log_evidence[1] - log_evidence[0])))
 
