@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
 
+ASKEW_PASSES, ASKEW_M = 2, 0.7
+"""Where so many passes report only the one of two places, and as many only the other, some may be laid askew together:
+they agree among themselves, and are off from the others by this much, an axis, which their covariances do not know."""
 MISSED_NATS = 1.0
 """Evidence of each pass that reports only the rarer of two places that they are one: passes miss few signs."""
 
@@ -31,11 +34,18 @@ def merge(places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, 
     xy_m, cov = _sums(places, sign, n_signs)
     pairs = cKDTree(xy_m).query_pairs(REACH_M / 2, output_type="ndarray")
     one, two = pairs.T
+    by_sign = np.argsort(sign, kind="stable")
+    start = np.searchsorted(sign[by_sign], np.arange(n_signs + 1))
+    owner = np.repeat(np.arange(len(places.first) - 1), np.diff(places.first))
+    n_both, n_lonely = _passes_of_pairs(one, two, by_sign, start, owner, places)
+    drove_by = places.n_around[by_sign[start[:-1]]] > 0
+    askew = (n_lonely >= ASKEW_PASSES) & (n_lonely > ASKEW_PASSES * n_both) & drove_by[one] & drove_by[two]
     s, d = cov[one] + cov[two], xy_m[one] - xy_m[two]
+    s[askew, :2] += ASKEW_M**2
     det = s[:, 0] * s[:, 1] - s[:, 2] ** 2
     chi2 = (s[:, 1] * d[:, 0] ** 2 - 2 * s[:, 2] * d[:, 0] * d[:, 1] + s[:, 0] * d[:, 1] ** 2) / det
     likely = chi2 < GATE_CHI2
-    one, two, chi2, det = one[likely], two[likely], chi2[likely], det[likely]
+    one, two, chi2, det, n_both, n_lonely = (values[likely] for values in (one, two, chi2, det, n_both, n_lonely))
     log_class = np.zeros((n_signs, len(log_prior)))
     np.add.at(log_class, sign, log_confusion[places.kind_code, :, places.class_code])
     own = np.logaddexp.reduce(log_class + log_prior, axis=1)
@@ -43,10 +53,6 @@ def merge(places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, 
     # the class share of a birth, 1 / n_classes, is in `own`
     saved = birth_cost - np.log(len(log_prior)) - (0.5 * chi2 + np.log(2 * np.pi) + 0.5 * np.log(det))
     saved -= own[one] + own[two] - together
-    by_sign = np.argsort(sign, kind="stable")
-    start = np.searchsorted(sign[by_sign], np.arange(n_signs + 1))
-    owner = np.repeat(np.arange(len(places.first) - 1), np.diff(places.first))
-    n_both, n_lonely = _passes_of_pairs(one, two, by_sign, start, owner, places)
     saved += MISSED_NATS * n_lonely - birth_cost * n_both
     # a track that would be cast out must be outweighed by passes that report the rarer place alone
     worth = np.flatnonzero((saved > 0) & ((n_both == 0) | (n_lonely > n_both)))

@@ -29,6 +29,8 @@ SPREAD_M = 1.0
 """Spread over frames of a mean that does not bring one."""
 FLOOR_M = 0.05
 """A mean is never better than this, an axis: its frames share more than a calibration."""
+LEVER_ERROR = 0.2
+"""Of what biases do to a mean, its mean range and direction of view tell all but this part: they stand for all frames."""
 SCALE_DOF = 30.0
 """Degrees of freedom with which the scale of a pass is held to 1 before its residuals speak."""
 SPOILT_RATIO = 4.0
@@ -123,7 +125,8 @@ def tracks_of_means(
     design[:, 0, 0] = design[:, 1, 1] = 1.0
     design[:, 0, 2], design[:, 1, 2] = east * is_viewed, north * is_viewed
     design[:, 0, 3], design[:, 1, 3] = -reach * north, reach * east
-    cov[~is_viewed] += (bias_sigma[~is_viewed, 0] ** 2)[:, None, None] * np.eye(2)
+    lever = bias_sigma[:, 0] ** 2 + (reach * bias_sigma[:, 1]) ** 2
+    cov += (np.where(is_viewed, LEVER_ERROR**2, 1.0) * lever)[:, None, None] * np.eye(2)
     return np.swapaxes(design, 1, 2) @ np.linalg.solve(cov, design), np.zeros((len(xy_m), 4))
 
 
