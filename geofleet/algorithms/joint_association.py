@@ -65,9 +65,7 @@ class _Grid(NamedTuple):
     width: int
 
 
-def sweep(
-    places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, *, birth_cost: float
-) -> Ints:
+def sweep(places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, *, birth_cost: float) -> Ints:
     """Assign every pass anew against all others.
 
     Parameters
