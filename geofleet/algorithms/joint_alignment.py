@@ -32,6 +32,8 @@ FEW_OFFSETS = 256
 """So many candidate offsets are all weighed; of more, those that most rows vote for."""
 VOTED_OFFSETS = 32
 VOTE_CELL_M = 0.5
+ENOUGH_ROWS = 200
+"""So many rows, evenly along the pass, tell offsets apart; all of them say where exactly the one chosen lies."""
 N_ROUNDS = 3
 MOVED_M = 0.25
 NO_POINT = -1
@@ -160,19 +162,26 @@ def _near(xy_m: Floats, rows: Ints, total: Floats, count: Ints, n_points: int, r
             if low_e <= east <= high_e and low_n <= north <= high_n:
                 inside[n_inside] = k
                 n_inside += 1
+    inside = inside[:n_inside]
+    east_of = np.array([total[k, 0] / count[k] for k in inside])
+    by_east = np.argsort(east_of, kind="mergesort")
+    inside, east_of = inside[by_east], east_of[by_east]
+    begin = np.searchsorted(east_of, xy_m[rows, 0] - reach_m)
     start = np.zeros(rows.size + 1, np.int64)
     near = np.empty(rows.size * 8 + 8, np.int64)
     n_near = 0
     for r in range(rows.size):
-        for k in inside[:n_inside]:
-            east = total[k, 0] / count[k] - xy_m[rows[r], 0]
-            north = total[k, 1] / count[k] - xy_m[rows[r], 1]
+        for at in range(begin[r], n_inside):
+            east = east_of[at] - xy_m[rows[r], 0]
+            if east > reach_m:
+                break
+            north = total[inside[at], 1] / count[inside[at]] - xy_m[rows[r], 1]
             if east * east + north * north < reach_m * reach_m:
                 if n_near == near.size:
                     grown = np.empty(2 * near.size, np.int64)
                     grown[:n_near] = near
                     near = grown
-                near[n_near] = k
+                near[n_near] = inside[at]
                 n_near += 1
         start[r + 1] = n_near
     return near[:n_near], start
@@ -191,10 +200,11 @@ def _gain(  # noqa: PLR0917
     of_class: Ints,
     near: Ints,
     near_start: Ints,
+    step: int,
 ) -> tuple[float, float, float]:
-    """Return the log-likelihood of an offset, and the offset that the partners it finds agree on."""
+    """Return the log-likelihood of an offset by every so many-th row, and the offset that their partners agree on."""
     value, weight, sum_e, sum_n = 0.0, 1e-12, 0.0, 0.0
-    for r in range(rows.size):
+    for r in range(0, rows.size, step):
         i = rows[r]
         var = spread_m[i] ** 2
         best, best_e, best_n = 0.0, 0.0, 0.0
@@ -234,16 +244,21 @@ def _best(  # noqa: PLR0917
     """Return the likeliest offset, among those that bring a row onto a point of its class and the present one."""
     best, found_e, found_n = -np.inf, offset[0], offset[1]
     candidates = _candidates(xy_m, class_code, rows, total, count, of_class, near, near_start, offset)
+    step = 1 + rows.size // ENOUGH_ROWS
     for at in range(len(candidates)):
         east, north = candidates[at]
         for _ in range(2):  # as it stands, and where its partners pull it
             value, pulled_e, pulled_n = _gain(
-                east, north, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start
+                east, north, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start, step
             )
             value -= (east * east + north * north) / (2 * sigma2)
             if value > best:
                 best, found_e, found_n = value, east, north
             east, north = pulled_e, pulled_n
+    if step > 1:
+        _, found_e, found_n = _gain(
+            found_e, found_n, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start, 1
+        )
     return found_e, found_n
 
 
@@ -309,19 +324,13 @@ def _lay(  # noqa: PLR0917
     n_points: int,
 ) -> int:
     """Add the rows of a pass to the map: to the nearest free point of their class, or as new points."""
-    taken = np.full(rows.size, NO_POINT)
+    is_taken = np.zeros(n_points + rows.size, np.bool_)  # a point that a row of this pass has is not free
     for r in range(rows.size):
         i = rows[r]
         best, reach2 = NO_POINT, (3 * spread_m[i]) ** 2
         for at in range(near_start[r], near_start[r + 1]):
             k = near[at]
-            if of_class[k] != class_code[i]:
-                continue
-            # `near` was found before the rows were laid: a point that a row of this pass has is not free
-            is_free = True
-            for other in taken[:r]:
-                is_free = is_free and other != k
-            if is_free:
+            if of_class[k] == class_code[i] and not is_taken[k]:
                 de = xy_m[i, 0] - offset[0] - total[k, 0] / count[k]
                 dn = xy_m[i, 1] - offset[1] - total[k, 1] / count[k]
                 if de * de + dn * dn < reach2:
@@ -333,7 +342,7 @@ def _lay(  # noqa: PLR0917
                 best, n_points = n_points, n_points + 1
             total[best] = 0.0
             of_class[best] = class_code[i]
-        taken[r] = best
+        is_taken[best] = True
         point_of[i] = best
         total[best] += xy_m[i] - offset
         count[best] += 1

@@ -42,6 +42,8 @@ PRIOR_IS_OFF = 0.5
 """Probability beforehand that it is off."""
 LEFT_OUT = 0.1
 """What a 90 % ellipse leaves out: up to so much the other translation need not lie in it."""
+BLOCK = 65_536
+"""Tracks that are looked at together: matrices of all would be large."""
 AS_READ = 1e-6
 """Share of misread tracks where nothing can show one."""
 PRIOR_RETYPED = 0.1
@@ -215,9 +217,10 @@ class Search:
         own, right = np.zeros((len(sigma), 4, 4)), np.zeros((len(sigma), 4))
         np.add.at(own, code, tracks.matrix)
         np.add.at(right, code, said)
-        root = sigma[code][:, :, None] * np.eye(4)
-        inner = np.eye(4) + root @ (own[code] - tracks.matrix) @ root
-        self.at_cov = root @ np.linalg.solve(inner, root)
+        for rows in np.array_split(np.arange(len(code)), 1 + len(code) // BLOCK):
+            root = sigma[code[rows]][:, :, None] * np.eye(4)
+            inner = np.eye(4) + root @ (own[code[rows]] - tracks.matrix[rows]) @ root
+            self.at_cov[rows] = root @ np.linalg.solve(inner, root)
         self.at = np.einsum("tij,tj->ti", self.at_cov, right[code] - said)
 
     def learn(self) -> None:

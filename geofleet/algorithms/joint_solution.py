@@ -25,10 +25,12 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
 
-DENSE_UNKNOWNS = 3000
-"""Up to so many unknowns the dense factor is the fastest, and 72 MB."""
+DENSE_UNKNOWNS = 5000
+"""Up to so many unknowns the dense factor is the fastest, and 200 MB."""
+DENSE_SHARE = 0.05
+"""From this share of all pairs of pass and sign on they are multiplied as dense matrices."""
 BLOCK = 512
-"""Columns of the inverse that are solved for at a time."""
+"""Columns of the inverse that are solved for at a time, and rows of the product."""
 LEAST_VAR = 1e-12
 """Variance of what is known exactly: a bias that a sensor cannot have."""
 
@@ -105,7 +107,7 @@ def solve(
     eta = np.zeros((n_signs, 2))
     np.add.at(eta, sign, residual[:, :2])
     eliminated = sparse.bsr_array((gain, np.arange(n_passes), np.arange(n_passes + 1))).tocsr() @ coupling
-    system = sparse.bsr_array((diagonal, np.arange(n_signs), np.arange(n_signs + 1))).tocsr() - coupling.T @ eliminated
+    system = _without_passes(diagonal, coupling, eliminated, gain)
     wanted = [eta.ravel() - eliminated.T @ right.ravel()]
     if marginal_of is not None:
         wanted += list(eliminated[4 * marginal_of : 4 * marginal_of + 4].toarray())
@@ -114,6 +116,24 @@ def solve(
     marginal = None if marginal_of is None else gain[marginal_of] + np.stack(wanted[1:]) @ solved[:, 1:]
     moved = nuisance + np.einsum("vij,vj->vi", gain, right - (coupling @ step).reshape(n_passes, 4))
     return Solution(start + step.reshape(n_signs, 2), cov, moved, np.asarray(gain, np.float64), marginal)
+
+
+def _without_passes(
+    diagonal: Floats, coupling: sparse.csr_array, eliminated: sparse.csr_array, gain: Floats
+) -> sparse.csr_array | Floats:
+    """Return Λ, dense where it is small and passes touch much of it: then the dense product is many times faster."""
+    n_rows, n = coupling.shape
+    own = sparse.bsr_array((diagonal, np.arange(len(diagonal)), np.arange(len(diagonal) + 1))).tocsr()
+    if n > DENSE_UNKNOWNS or coupling.nnz < DENSE_SHARE * n_rows * n:
+        system: sparse.csr_array = own - coupling.T @ eliminated
+        return system
+    root = np.swapaxes(np.linalg.cholesky(gain), 1, 2)
+    halves = sparse.bsr_array((root, np.arange(len(gain)), np.arange(len(gain) + 1))).tocsr() @ coupling
+    whole: Floats = own.toarray()
+    for begin in range(0, n_rows, BLOCK):
+        half = halves[begin : begin + BLOCK].toarray()
+        whole -= half.T @ half
+    return whole
 
 
 def _means(xy_m: Floats, weight: Floats, sign: Ints, n_signs: int) -> Floats:
@@ -136,18 +156,22 @@ def _blocks(blocks: Floats, row: Ints, column: Ints, shape: tuple[int, int]) -> 
     return matrix
 
 
-def _solved(system: sparse.csr_array, right: Floats, *, with_cov: bool) -> tuple[Floats, Floats]:
+def _solved(system: sparse.csr_array | Floats, right: Floats, *, with_cov: bool) -> tuple[Floats, Floats]:
     """Solve the symmetric positive definite system; also the 2 by 2 blocks on the diagonal of its inverse."""
     n = len(right)
     if n <= DENSE_UNKNOWNS:
-        factor = linalg.cho_factor(system.toarray(), lower=True, overwrite_a=True, check_finite=False)
+        whole = system if isinstance(system, np.ndarray) else system.toarray()
+        # symmetric: the transpose is the same matrix in the order that is factored in place
+        factor = linalg.cho_factor(whole.T, lower=True, overwrite_a=True, check_finite=False)
         step = linalg.cho_solve(factor, right, check_finite=False)
         if not with_cov:
             return step, np.zeros((n // 2, 2, 2))
         inverse = linalg.cho_solve(factor, np.eye(n), check_finite=False)
         at = np.arange(n).reshape(-1, 2)
         return step, inverse[at[:, :, None], at[:, None, :]]
-    lu = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
+    lu = splu(
+        sparse.csc_array(system), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
+    )
     step = lu.solve(right)
     cov = np.zeros((n // 2, 2, 2))
     for begin in range(0, n if with_cov else 0, BLOCK):

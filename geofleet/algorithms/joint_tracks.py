@@ -30,7 +30,7 @@ SPREAD_M = 1.0
 FLOOR_M = 0.05
 """A mean is never better than this, an axis: its frames share more than a calibration."""
 LEVER_ERROR = 0.2
-"""Of what biases do to a mean, its mean range and direction of view tell all but this part: they stand for all frames."""
+"""Of what biases do to a mean, its mean range and direction do not tell this part: they stand for all frames."""
 SCALE_DOF = 30.0
 """Degrees of freedom with which the scale of a pass is held to 1 before its residuals speak."""
 SPOILT_RATIO = 4.0

@@ -113,7 +113,7 @@ def dense(tracks: Tracks, passes: Passes, sign: Ints, n_signs: int) -> tuple[Flo
     return np.linalg.solve(system, right), np.linalg.inv(system)
 
 
-@pytest.mark.parametrize("dense_unknowns", [3000, 0])
+@pytest.mark.parametrize("dense_unknowns", [5000, 0])
 def test_elimination_equals_least_squares_with_all_unknowns(
     monkeypatch: pytest.MonkeyPatch, dense_unknowns: int
 ) -> None:
