@@ -109,3 +109,19 @@ def test_a_drive_is_derived_and_passes_33_signs(raw, core, name, n_classes):
     assert len({sign_class for _, sign_class in passed}) == n_classes
     speed = np.array(drive["speed_mps"].to_pylist())
     assert 1.0 < speed.min() <= speed.max() < 10.1
+
+
+def test_data_from_outside_that_the_package_carries_is_registered(repo, raw):
+    folder = repo / "geofleet" / "formats"
+    with (folder / "SOURCES.csv").open(encoding="utf-8", newline="") as file:
+        reader = csv.DictReader(file)
+        entries = list(reader)
+    with (raw / "SOURCES.csv").open(encoding="utf-8", newline="") as file:
+        assert reader.fieldnames == csv.DictReader(file).fieldnames
+    ours = {"SOURCES.csv", "drive_profiles.toml"}  # written for geofleet
+    carried = {path.name for path in folder.iterdir() if path.is_file() and path.suffix not in {".py", ".pyi"}}
+    assert {entry["file"] for entry in entries} == carried - ours
+    for entry in entries:
+        assert hashlib.sha256((folder / entry["file"]).read_bytes()).hexdigest() == entry["sha256"]
+        assert entry["licence"].startswith("Public domain")
+        assert (repo / entry["how"].split(";")[0]).is_file()
