@@ -235,9 +235,11 @@ def load_config(scenario: str | Path = ROOT_SCENARIO, overrides: Mapping[str, An
     path = _find(scenario)
     tree = _read(path, seen=())
     pairs = overrides.items() if hasattr(overrides, "items") else (_split_override(text) for text in overrides)
+    given = set()
     for key, value in pairs:
         *place, name = _locate(key, where="--set")
         _reach(tree, place)[name] = value
+        given.add((*place, name))
     mixed = {
         name: {"share": keys.pop("share", None), "sensor": {**tree["sensor"], "sensor_kind": name, **keys}}
         for name, keys in tree.pop(MIXED, {}).items()
@@ -245,7 +247,7 @@ def load_config(scenario: str | Path = ROOT_SCENARIO, overrides: Mapping[str, An
     try:
         return Config.model_validate({"scenario": path.stem, **tree, MIXED: mixed})
     except ValidationError as error:
-        raise ConfigError(*_explain(error, path)) from None
+        raise _explained(error, path, given) from None
 
 
 def _find(scenario: str | Path, beside: Path | None = None) -> Path:
@@ -329,10 +331,22 @@ def _split_override(text: str) -> tuple[str, Any]:
         return key.strip(), value.strip()  # a bare word: --set tracker=kalman
 
 
-def _explain(error: ValidationError, path: Path) -> tuple[str]:
-    faults = "; ".join(
-        f"{'.'.join(str(part) for part in fault['loc'])}: {fault['msg']}"
-        + ("" if fault["type"] == "missing" else f" (got {fault['input']!r})")
-        for fault in error.errors()
-    )
-    return (f"{path}: {faults}. Correct the value in the file or the --set option.",)
+def _explained(error: ValidationError, path: Path, given: set[tuple[str, ...]]) -> ConfigError:
+    """Return one error of all faults; a file is named unless every fault is a key that was given beside it."""
+    faults: dict[str, str] = {}
+    is_of_file = False
+    for fault in error.errors():
+        place = tuple(str(part) for part in fault["loc"])
+        if place[:1] == (MIXED,):
+            place = tuple(part for part in place if part != "sensor")
+            if f"sensor.{place[-1]}" in faults and place not in given:
+                continue  # it has that from [sensor]
+        key = place[: 3 if place[:1] == (MIXED,) else 2]
+        is_of_file |= key not in given and not (not key and any(MIXED in other for other in given))
+        if place:
+            got = "" if fault["type"] == "missing" else f" (got {fault['input']!r})"
+            faults[".".join(place)] = f"{'.'.join(place)}: {fault['msg']}{got}"
+        else:
+            faults[""] = str(fault["ctx"]["error"])
+    todo = "Correct the value in the file or the option." if is_of_file else "Correct the option."
+    return ConfigError("; ".join(faults.values()) + ".", where=str(path) if is_of_file else "", todo=todo)

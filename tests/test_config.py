@@ -69,6 +69,25 @@ def test_bad_overrides_are_named(overrides, message):
         load_config("paper", overrides)
 
 
+def test_a_bad_value_is_blamed_on_the_option_or_the_file_that_gives_it(tmp_path):
+    for key in ("fov_deg=400", "send_information=maybe", "mixed.rtk.range_m=-1"):
+        with pytest.raises(ConfigError) as given:
+            load_config("paper", [key, "mixed.rtk.share=0.1"])
+        assert "paper.toml" not in str(given.value)
+        assert str(given.value).endswith("Correct the option.")
+    with pytest.raises(
+        ConfigError, match=r"^the shares of \[mixed\] add up to 1\.4, more than the whole fleet\. Correct"
+    ):
+        load_config("paper", ["mixed.a.share=0.7", "mixed.b.share=0.7"])
+    path = tmp_path / "mine.toml"
+    path.write_text("[sensor]\nfov_deg = 400\n")
+    for options in ([], ["range_m=-1"]):
+        with pytest.raises(
+            ConfigError, match=r"mine\.toml: sensor.*fov_deg: .*Correct the value in the file or the option"
+        ):
+            load_config(path, options)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -391,8 +391,9 @@ def _open(schema: Schema, path: Path) -> ds.Dataset:
     try:
         dataset = ds.dataset(path, format="parquet", partitioning=partitioning if path.is_dir() else None)
     except (pa.ArrowInvalid, OSError) as error:
+        why = "" if "magic bytes" in str(error) else f" ({str(error).splitlines()[0]})"
         raise InputError(
-            f"not a Parquet file ({str(error).splitlines()[0]}).",
+            f"not a Parquet file{why}.",
             where=str(path),
             todo=f"A {schema.name} table is expected; `geofleet ingest` makes one from other formats.",
         ) from None

@@ -123,7 +123,7 @@ def test_reading_what_is_not_parquet(tmp_path):
     for name, message in (
         ("absent.parquet", "no such file"),
         ("empty.parquet", "not a Parquet file"),
-        ("text.parquet", "not a Parquet file"),
+        ("text.parquet", r"not a Parquet file\. A drives table is expected"),
         ("folder", "holds no Parquet file"),
     ):
         with pytest.raises(InputError, match=message):
