@@ -37,17 +37,16 @@ def in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
     cosine, which falls all the way from 0 to π.
     """
     # Room for every candidate: arrays that grow inside the loop make it three times as slow.
-    room = _n_candidates(pose_xy_m, heading_rad, cell_start, origin_xy_m, shape, cell_m, range_m, half_fov_rad)
+    ahead, cells, room = _cones(pose_xy_m, heading_rad, cell_start, origin_xy_m, shape, cell_m, range_m, half_fov_rad)
     frames, signs = np.empty(room, np.int64), np.empty(room, np.int64)
     distances, forwards, lefts = np.empty(room), np.empty(room), np.empty(room)
     n, cos_half = 0, np.cos(half_fov_rad)
     for frame in range(len(pose_xy_m)):
         x, y = pose_xy_m[frame, 0], pose_xy_m[frame, 1]
-        ahead_x, ahead_y = np.cos(heading_rad[frame]), np.sin(heading_rad[frame])
-        columns = _cells(x - origin_xy_m[0], ahead_x, ahead_y, cell_m, shape[1], range_m, half_fov_rad)
-        rows = _cells(y - origin_xy_m[1], ahead_y, ahead_x, cell_m, shape[0], range_m, half_fov_rad)
-        for row in range(rows[0], rows[1] if columns[0] < columns[1] else 0):
-            for k in range(cell_start[row * shape[1] + columns[0]], cell_start[row * shape[1] + columns[1]]):
+        ahead_x, ahead_y = ahead[frame, 0], ahead[frame, 1]
+        for row in range(cells[frame, 2], cells[frame, 3]):
+            first, last = row * shape[1] + cells[frame, 0], row * shape[1] + cells[frame, 1]
+            for k in range(cell_start[first], cell_start[last]):
                 dx, dy = sign_xy_m[cell_sign[k], 0] - x, sign_xy_m[cell_sign[k], 1] - y
                 square = dx * dx + dy * dy
                 if square < range_m * range_m:
@@ -63,24 +62,7 @@ def in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
 
 
 @njit(cache=True, nogil=True)
-def _cells(  # noqa: PLR0917 - numba takes no keyword-only arguments
-    place_m: float, ahead: float, aside: float, cell_m: float, n_cells: int, range_m: float, half_fov_rad: float
-) -> tuple[int, int]:
-    """Return the first and the last cell, half-open, that a view cone touches along one axis.
-
-    `place_m` is its tip and `ahead` the component of its direction on the axis, `aside` that on the other.
-    """
-    cos_half, sin_half = np.cos(half_fov_rad), np.sin(half_fov_rad)
-    one, two = ahead * cos_half - aside * sin_half, ahead * cos_half + aside * sin_half  # the two edges
-    most = 1.0 if ahead >= cos_half else max(0.0, one, two)
-    least = -1.0 if -ahead >= cos_half else min(0.0, one, two)
-    first = int(np.floor((place_m + least * range_m - ROUNDING_M) / cell_m))
-    last = int(np.floor((place_m + most * range_m + ROUNDING_M) / cell_m))
-    return max(first, 0), max(min(last + 1, n_cells), 0)
-
-
-@njit(cache=True, nogil=True)
-def _n_candidates(  # noqa: PLR0917 - numba takes no keyword-only arguments
+def _cones(  # noqa: PLR0917 - numba takes no keyword-only arguments
     pose_xy_m: Floats,
     heading_rad: Floats,
     cell_start: Ints,
@@ -89,18 +71,47 @@ def _n_candidates(  # noqa: PLR0917 - numba takes no keyword-only arguments
     cell_m: float,
     range_m: float,
     half_fov_rad: float,
-) -> int:
-    """Return how many pairs of a frame and a sign lie in cells that the view cone touches."""
-    n = 0
+) -> tuple[Floats, Ints, int]:
+    """Return the direction of each frame, the cells that its view cone touches, and how many signs these hold in all.
+
+    Cells are first and last column and first and last row, half-open; none where the cone touches none.
+    """
+    ahead, cells, n = np.empty((len(pose_xy_m), 2)), np.zeros((len(pose_xy_m), 4), np.int64), 0
+    cos_half, sin_half = np.cos(half_fov_rad), np.sin(half_fov_rad)
     for frame in range(len(pose_xy_m)):
         ahead_x, ahead_y = np.cos(heading_rad[frame]), np.sin(heading_rad[frame])
+        ahead[frame, 0], ahead[frame, 1] = ahead_x, ahead_y
         x, y = pose_xy_m[frame, 0] - origin_xy_m[0], pose_xy_m[frame, 1] - origin_xy_m[1]
-        columns = _cells(x, ahead_x, ahead_y, cell_m, shape[1], range_m, half_fov_rad)
-        rows = _cells(y, ahead_y, ahead_x, cell_m, shape[0], range_m, half_fov_rad)
-        for row in range(rows[0], rows[1]):
-            if columns[0] < columns[1]:
-                n += cell_start[row * shape[1] + columns[1]] - cell_start[row * shape[1] + columns[0]]
-    return n
+        left, right = _cells(x, ahead_x, ahead_y, cell_m, shape[1], range_m, cos_half, sin_half)
+        low, high = _cells(y, ahead_y, ahead_x, cell_m, shape[0], range_m, cos_half, sin_half)
+        if left < right and low < high:
+            cells[frame, 0], cells[frame, 1], cells[frame, 2], cells[frame, 3] = left, right, low, high
+            for row in range(low, high):
+                n += cell_start[row * shape[1] + right] - cell_start[row * shape[1] + left]
+    return ahead, cells, n
+
+
+@njit(cache=True, nogil=True)
+def _cells(  # noqa: PLR0917 - numba takes no keyword-only arguments
+    place_m: float,
+    ahead: float,
+    aside: float,
+    cell_m: float,
+    n_cells: int,
+    range_m: float,
+    cos_half: float,
+    sin_half: float,
+) -> tuple[int, int]:
+    """Return the first and the last cell, half-open, that a view cone touches along one axis.
+
+    `place_m` is its tip and `ahead` the component of its direction on the axis, `aside` that on the other.
+    """
+    one, two = ahead * cos_half - aside * sin_half, ahead * cos_half + aside * sin_half  # the two edges
+    most = 1.0 if ahead >= cos_half else max(0.0, one, two)
+    least = -1.0 if -ahead >= cos_half else min(0.0, one, two)
+    first = int(np.floor((place_m + least * range_m - ROUNDING_M) / cell_m))
+    last = int(np.floor((place_m + most * range_m + ROUNDING_M) / cell_m))
+    return max(first, 0), max(min(last + 1, n_cells), 0)
 
 
 @njit(cache=True, nogil=True)
