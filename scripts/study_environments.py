@@ -53,7 +53,7 @@ def helsinki(folder: Path) -> World:
     """Return the shipped place under the scenario `urban`."""
     signs = as_signs_table(RAW / "helsinki.osm.pbf", folder)
     drive = as_drives_table(RAW / "helsinki_derived.pos", folder / "helsinki.parquet")
-    return World("urban, Helsinki", "", signs, drive, load_config("urban"))
+    return World("Helsinki (urban)", "", signs, drive, load_config("urban"))
 
 
 def environments(folder: Path) -> tuple[World, ...]:
@@ -67,7 +67,7 @@ def environments(folder: Path) -> tuple[World, ...]:
         own.mkdir(parents=True, exist_ok=True)
         derive(source, own / "drive.parquet", street)
         signs = as_signs_table(source, own)
-        worlds.append(World(f"{scenario}, {place}", "", signs, own / "drive.parquet", load_config(scenario)))
+        worlds.append(World(f"{place} ({scenario})", "", signs, own / "drive.parquet", load_config(scenario)))
     return tuple(worlds)
 
 
@@ -107,7 +107,7 @@ def main() -> None:
     """Run both studies; what is done is not done again."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("data/processed/study"))
-    parser.add_argument("--replicates", type=int, default=10)
+    parser.add_argument("--replicates", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
