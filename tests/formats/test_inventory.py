@@ -282,7 +282,7 @@ def test_stacks_are_taken_apart(write, code, separator):
         (["regulatory--yield--g1"], {}, ["yield"]),
         (["DE:274.1[30];DE:240"], {}, ["speed_zone", "shared_path"]),
         (["B9", "F34b1", "C43"], {}, ["priority_road", None, "speed_limit"]),
-        (["A,1c"], {"scheme": "vienna"}, ["double_curve_right"]),
+        (["A,1c"], {"scheme": "vienna"}, ["double_curve_left"]),
         (["qq", ""], {"country": "BE"}, ["raw:qq", "unspecified"]),
     ],
 )
