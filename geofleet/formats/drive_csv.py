@@ -6,6 +6,7 @@ guess, is told in the counts.
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -138,20 +139,22 @@ def _settled(
 def _read(path: Path, layout: Layout) -> tuple[pd.DataFrame, int]:
     """Return the lines as text columns, and how many have more fields than there are columns."""
     try:
-        frame = pd.read_csv(
-            path,
-            sep=layout.delimiter,
-            names=list(layout.names) or None,
-            header=None if layout.names else 0,
-            index_col=False,
-            dtype=str,
-            skiprows=layout.n_before,
-            encoding="utf-8-sig" if layout.encoding == "utf-8" else layout.encoding,
-            encoding_errors="replace",
-            quoting=0,
-            on_bad_lines="skip",
-            skipinitialspace=True,
-        )
+        with warnings.catch_warnings():  # of lines with more fields than the header the rest is left out
+            warnings.simplefilter("ignore", pd.errors.ParserWarning)
+            frame = pd.read_csv(
+                path,
+                sep=layout.delimiter,
+                names=list(layout.names) or None,
+                header=None if layout.names else 0,
+                index_col=False,
+                dtype=str,
+                skiprows=layout.n_before,
+                encoding="utf-8-sig" if layout.encoding == "utf-8" else layout.encoding,
+                encoding_errors="replace",
+                quoting=0,
+                on_bad_lines="skip",
+                skipinitialspace=True,
+            )
     except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, LookupError) as error:
         raise InputError(f"cannot be read as columns ({error}).", where=str(path), todo="Export it again.") from None
     frame.columns = [str(name).strip().strip('"') for name in frame.columns]

@@ -145,8 +145,8 @@ def _sentences(content: bytes) -> tuple[pd.DataFrame, dict[str, int]]:
     known = np.isin(kinds, _KNOWN)
     kept = np.flatnonzero(known & ~wrong)
     rows = [[kinds[i], *(matches[i][3].decode("ascii").split(",", _N_FIELDS))] for i in kept]
-    frame = pd.DataFrame([row + [None] * (_N_FIELDS + 1 - len(row)) for row in rows], columns=None, dtype=object)
-    frame = frame.reindex(columns=range(_N_FIELDS + 1))
+    padded = [(row + [None] * _N_FIELDS)[: _N_FIELDS + 1] for row in rows]
+    frame = pd.DataFrame(padded, columns=range(_N_FIELDS + 1), dtype=object)
     counts = {"sentences": len(matches), "wrong": int(wrong.sum()), "missing": int((missing & known).sum())}
     return frame, counts | {"other": int((~known & ~wrong).sum())}
 
