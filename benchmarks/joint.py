@@ -31,6 +31,8 @@ from joint_maps import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from geofleet.algorithms.metrics import MapScore
 
 RESULTS = Path(__file__).parent / "results/joint.json"
@@ -80,8 +82,8 @@ class Table(dict[str, Scores]):
 
 def bars(
     fleets: Path, case: Case, n_replicates: int, n_dbscan: int, vehicles: tuple[int, ...]
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Score every method at every fleet size; and how honest joint fusion is about its errors."""
+) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """Score every method at every fleet size; and how honest joint fusion is about its errors. A batch at a time."""
     honesty = {v: Honesty() for v in vehicles}
     tables: dict[int, Table] = {v: Table() for v in vehicles}
     unsettled = dict.fromkeys(vehicles, 0)
@@ -104,7 +106,7 @@ def bars(
             tables[v].add("known", best.score)
             honesty[v].add(run, fused, best)
             if v in WITH_PRIOR:
-                prior, judged = stale_prior(run, whole.reported, seed=number)
+                prior, judged = stale_prior(run, whole.in_view, seed=number)
                 tables[v].add("joint with a stale prior", score_joint(judged, joint(run, prior)))
                 tables[v].add("stale prior alone", score_prior(judged, prior))
             if number < n_dbscan:
@@ -113,21 +115,22 @@ def bars(
                         tables[v].add("dbscan corrected" if corrected else "dbscan", score_dbscan(run, found))
         if (number + 1) % case.batch == 0:
             for v in vehicles:
-                print(number + 1, v, _short(tables[v].summary()), unsettled[v], honesty[v].summary(), flush=True)
-    scores = {str(v): {**table.summary(), "unsettled": unsettled[v]} for v, table in tables.items()}
-    return scores, {str(v): honesty[v].summary() for v in vehicles}
+                print(number + 1, v, _short(tables[v].summary()), unsettled[v], flush=True)
+            scores = {str(v): {**table.summary(), "unsettled": unsettled[v]} for v, table in tables.items()}
+            yield scores, {str(v): honesty[v].summary() for v in vehicles}
 
 
 def priors(fleets: Path, case: Case, n_replicates: int, vehicles: tuple[int, ...]) -> dict[str, Any]:
     """Every fault of a prior alone, and all together, beside the map without it."""
     found: dict[str, Any] = {}
     for v in vehicles:
-        tables, shares = {name: Table() for name in PRIOR_CASES}, {name: [] for name in PRIOR_CASES}
+        tables = {name: Table() for name in PRIOR_CASES}
+        shares: dict[str, list[float]] = {name: [] for name in PRIOR_CASES}
         for number, whole in enumerate(runs(fleets, case, n_replicates)):
             run = whole.first_vehicles(v)
             alone = joint(run)
             for name, how in PRIOR_CASES.items():
-                prior, judged = stale_prior(run, whole.reported, how, seed=number)
+                prior, judged = stale_prior(run, whole.in_view, how, seed=number)
                 fused = joint(run, prior)
                 tables[name].add("with", score_joint(judged, fused))
                 tables[name].add("without", score_joint(run, alone))
@@ -168,8 +171,8 @@ def robustness(fleets: Path, name: str, n_replicates: int, vehicles: tuple[int, 
         }
         for v, table in tables.items()
     }
-    for v, row in found.items():
-        print(name, v, _short(row), f"coverage {row['coverage_90']:.2f} settled {row['settled']:.2f}", flush=True)
+    for size, row in found.items():
+        print(name, size, _short(row), f"coverage {row['coverage_90']:.2f} settled {row['settled']:.2f}", flush=True)
     return found
 
 
@@ -212,11 +215,10 @@ def main() -> None:
     case = Case(given.scenario, given.drive, {"tracker": given.tracker})
     name = f"{given.scenario}, {given.tracker}, {given.drive}"
     if given.what == "bars":
-        scores, honesty = bars(
-            given.fleets, case, given.replicates, given.dbscan_replicates, tuple(given.vehicles or VEHICLES)
-        )
-        keep("bars", name, scores)
-        keep("honesty", name, honesty)
+        sizes = tuple(given.vehicles or VEHICLES)
+        for scores, honesty in bars(given.fleets, case, given.replicates, given.dbscan_replicates, sizes):
+            keep("bars", name, scores)
+            keep("honesty", name, honesty)
     elif given.what == "prior":
         keep("prior", name, priors(given.fleets, case, given.replicates, tuple(given.vehicles or (3, 20, 50))))
     elif given.what == "robustness":

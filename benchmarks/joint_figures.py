@@ -142,7 +142,7 @@ def _draw_ellipses(axes: Axes, run: Run) -> None:
     kept = accepted(fused)
     turn = np.linspace(0, 2 * np.pi, 60)
     circle = np.sqrt(4.605) * np.column_stack((np.cos(turn), np.sin(turn)))
-    middle, half = np.median(run.reference_xy, axis=0), 45.0
+    middle, half = np.median(run.reference_xy, axis=0), 110.0
     axes.plot(*run.reference_xy.T, "+", color=BLACK, markersize=7, label="true sign", zorder=3)
     for at, (xy, cov) in enumerate(zip(fused.xy_m[kept], fused.cov_m2[kept], strict=True)):
         ring = xy + circle @ np.linalg.cholesky(cov).T

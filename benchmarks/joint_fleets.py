@@ -129,6 +129,14 @@ class Run:
         told: Ints = np.unique(self.true_sign[self.true_sign >= 0])
         return told
 
+    @cached_property
+    def in_view(self) -> Ints:
+        """Rows of the reference that at least half of the passes report: what the drive has in view, not in passing."""
+        pairs = np.unique(np.column_stack((self.true_sign, self.fleet.tracks.pass_code))[self.true_sign >= 0], axis=0)
+        n_passes = np.bincount(pairs[:, 0], minlength=len(self.reference_xy))
+        rows: Ints = np.flatnonzero(2 * n_passes >= self.passes.num_rows)
+        return rows
+
     def score(self, xy_m: Floats, class_code: Ints) -> MapScore:
         """Score a map against the signs that were reported."""
         return score_points(

@@ -126,7 +126,7 @@ def own_sign(run: Run, fused: JointMap) -> Ints:
 def stale_prior(run: Run, rows: Ints, how: Staleness = STALE, *, seed: int) -> tuple[PriorMap, Run]:
     """Return an outdated map of some signs, and the run scored against what was reported or the prior holds.
 
-    `rows` of the reference: those that the largest fleet reported; no fleet can judge what nobody could report.
+    `rows` of the reference: those that the drive has in view; no fleet can judge what nobody could report.
     """
     scene, code = run.reference.take(pa.array(rows)), run.reference_code[rows]
     lon, lat = lonlat(scene)

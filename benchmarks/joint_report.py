@@ -26,8 +26,8 @@ prior map, signs that it holds count too. Gate 2 m, equal class. *Known associat
 track is of which sign; it pays for nothing else, so what separates it from the truth is noise and the GNSS offset that
 a fleet has in common. *DBSCAN corrected* is DBSCAN after `--correct-bias`, on the same detections and passes.
 
-The figures are of few replicates, whose number stands beside them: 20 or 5 do not settle a 1st percentile or a bar, and
-hard cases were measured as the method grew. `benchmarks/joint.py bars --replicates 200` makes them anew.
+The number of replicates stands beside every figure; few of them settle no 1st percentile. A prior map holds the signs
+that at least half of the passes of the largest fleet report, less what is outdated.
 """
 
 HONESTY = """Relative places: the common translation of the map is taken out. The bound is Bayesian, with known
