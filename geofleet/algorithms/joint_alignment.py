@@ -188,6 +188,21 @@ def _near(xy_m: Floats, rows: Ints, total: Floats, count: Ints, n_points: int, r
 
 
 @njit(cache=True, nogil=True)
+def _around(class_code: Ints, rows: Ints, count: Ints, of_class: Ints, near: Ints, near_start: Ints) -> Ints:  # noqa: PLR0917
+    """Return how many tracks of its class lie around each row.
+
+    A point that has most of them is the likelier partner: of two copies of one map, which half of the passes made each,
+    the larger one grows, where both would last if all points were alike.
+    """
+    around = np.zeros(rows.size, np.int64)
+    for r in range(rows.size):
+        for k in near[near_start[r] : near_start[r + 1]]:
+            if of_class[k] == class_code[rows[r]]:
+                around[r] += count[k]
+    return around
+
+
+@njit(cache=True, nogil=True)
 def _gain(  # noqa: PLR0917
     east: float,
     north: float,
@@ -200,6 +215,7 @@ def _gain(  # noqa: PLR0917
     of_class: Ints,
     near: Ints,
     near_start: Ints,
+    around: Ints,
     step: int,
 ) -> tuple[float, float, float]:
     """Return the log-likelihood of an offset by every so many-th row, and the offset that their partners agree on."""
@@ -215,7 +231,9 @@ def _gain(  # noqa: PLR0917
             chi2 = ((de - east) ** 2 + (dn - north) ** 2) / var
             if chi2 < PARTNER_CHI2:
                 density = np.exp(-chi2 / 2) / (2 * np.pi * var * SIGN_DENSITY_M2)
-                if of_class[k] != class_code[i]:
+                if of_class[k] == class_code[i]:
+                    density *= (count[k] + 1) / (around[r] - count[k] + 1)
+                else:
                     density *= OTHER_CLASS
                 if density > best:
                     best, best_e, best_n = density, de, dn
@@ -244,12 +262,13 @@ def _best(  # noqa: PLR0917
     """Return the likeliest offset, among those that bring a row onto a point of its class and the present one."""
     best, found_e, found_n = -np.inf, offset[0], offset[1]
     candidates = _candidates(xy_m, class_code, rows, total, count, of_class, near, near_start, offset)
+    around = _around(class_code, rows, count, of_class, near, near_start)
     step = 1 + rows.size // ENOUGH_ROWS
     for at in range(len(candidates)):
         east, north = candidates[at]
         for _ in range(2):  # as it stands, and where its partners pull it
             value, pulled_e, pulled_n = _gain(
-                east, north, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start, step
+                east, north, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start, around, step
             )
             value -= (east * east + north * north) / (2 * sigma2)
             if value > best:
@@ -257,7 +276,7 @@ def _best(  # noqa: PLR0917
             east, north = pulled_e, pulled_n
     if step > 1:
         _, found_e, found_n = _gain(
-            found_e, found_n, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start, 1
+            found_e, found_n, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start, around, 1
         )
     return found_e, found_n
 
