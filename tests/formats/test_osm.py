@@ -217,7 +217,7 @@ def test_a_file_that_is_no_map_is_refused_with_its_name(tmp_path, content, messa
 def test_a_missing_file_and_a_folder_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_signs(tmp_path / "none.osm")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="a folder, not a file"):
         read_lanes(tmp_path)
 
 
