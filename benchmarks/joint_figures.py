@@ -36,7 +36,9 @@ def draw_fleet_sizes(bars: dict[str, Any], path: Path) -> None:
     """Draw GOSPA_M and F1 over the number of passes, a row a drive."""
     names = [name for name in bars if name.startswith("paper-ideal, kalman")]
     n = min(row["joint"]["n"] for name in names for row in bars[name].values())
-    with figure_file(path, caption=f"{SIMULATED}; {n} replicates or more.", size=(9.0, 3.2 * len(names))) as figure:
+    n_dbscan = min(row["dbscan"]["n"] for name in names for row in bars[name].values())
+    caption = f"{SIMULATED}; {n} replicates, of DBSCAN the first {n_dbscan} of them: its medians are of other draws."
+    with figure_file(path, caption=caption, size=(9.0, 3.2 * len(names))) as figure:
         axes = figure.subplots(len(names), 2, squeeze=False)
         for (left, right), name in zip(axes, names, strict=True):
             for method, (colour, mark, dash, label) in LINES.items():
@@ -124,6 +126,9 @@ def _rms(xy_m: np.ndarray, run: Run, is_supported: np.ndarray) -> float:
     return float(np.sqrt(np.median((relative**2).sum(axis=1))))
 
 
+DENSE_M = 20.0
+
+
 def draw_map(fleets: Path, path: Path) -> None:
     """Draw the map of five passes and of fifty with 90 % ellipses, beside the true signs."""
     whole = next(iter(runs(fleets, DEMO, 1)))
@@ -142,7 +147,11 @@ def _draw_ellipses(axes: Axes, run: Run) -> None:
     kept = accepted(fused)
     turn = np.linspace(0, 2 * np.pi, 60)
     circle = np.sqrt(4.605) * np.column_stack((np.cos(turn), np.sin(turn)))
-    middle, half = np.median(run.reference_xy, axis=0), 110.0
+    apart = np.hypot(*(run.reference_xy[:, None] - run.reference_xy[None]).transpose(2, 0, 1))
+    middle, half = (
+        run.reference_xy[np.argmax((apart < DENSE_M).sum(axis=1))],
+        DENSE_M,
+    )  # where most signs stand together
     axes.plot(*run.reference_xy.T, "+", color=BLACK, markersize=7, label="true sign", zorder=3)
     for at, (xy, cov) in enumerate(zip(fused.xy_m[kept], fused.cov_m2[kept], strict=True)):
         ring = xy + circle @ np.linalg.cholesky(cov).T
