@@ -27,7 +27,9 @@ help: ## List the targets
 
 setup: $(READY) ## Make the virtual environment .venv from the lock file
 
-# uv when it is there, else venv and pip; the same locked, hashed versions either way.
+# uv when it is there, else venv and pip; the same locked, hashed versions either way. Then bytecode, which uv leaves out:
+# where Python may not keep any, every process would compile pandas and numba anew, some seconds each time.
+UNREAD := '[/\\](tests?|plotly|selenium|networkx|mypy|mypyc|debugpy|jedi|trio|stonesoup|wcwidth)[/\\]'
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "geofleet needs Python 3.11 or newer; name one: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 2; }
@@ -42,6 +44,7 @@ $(READY): requirements.lock pyproject.toml
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock; \
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .; \
 	fi
+	@$(BIN)/python -m compileall -q -j 0 -x $(UNREAD) $$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 	@touch $@
 
 demo: $(P)/report/_manifest.json ## Set up, run the main job on the shipped data, name what to open

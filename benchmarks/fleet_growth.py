@@ -1,7 +1,9 @@
 """Does F1 hold as passes grow to 2,000? The demo scene, DBSCAN's core rule fixed and following the passes.
 
-    python benchmarks/fleet_growth.py --replicates 3
+    python benchmarks/fleet_growth.py --seed 11 --replicates 10
 
+Means over replicates. `step` is the mean change of F1 from the size before, replicate by replicate, with its standard
+error: a fleet of 50 is the first 50 vehicles of the fleet of 100, so that the sizes share their luck.
 Detections are simulated; signs and the road are real (© OpenStreetMap contributors, ODbL).
 """
 
@@ -10,6 +12,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,7 +22,11 @@ from geofleet.steps.evaluate import evaluate
 from geofleet.steps.ingest import ingest_drive, ingest_signs
 from geofleet.steps.simulate import simulate
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 RAW = Path(__file__).parent.parent / "data" / "raw"
+KEYS = ("f1", "tp", "fp", "fn", "gospa_m")
 
 
 def main() -> None:
@@ -45,7 +52,8 @@ def main() -> None:
             n_replicates=args.replicates,
             seed=args.seed,
         )
-        print("vehicles  share     F1    tp    fp    fn  GOSPA_M")
+        print("vehicles  share     F1   step (s.e.)        tp    fp    fn  GOSPA_M")
+        before: dict[float, NDArray[np.float64]] = {}
         for size in args.sizes:
             for share in args.shares:
                 config = load_config(args.scenario, [*args.set, f"min_samples_share={share}"])
@@ -53,9 +61,16 @@ def main() -> None:
                 totals = evaluate(
                     folder / "fused.parquet", out / "reference.parquet", folder / "evaluation", config=config
                 ).totals
-                means = [np.mean([row[key] or 0 for row in totals]) for key in ("f1", "tp", "fp", "fn", "gospa_m")]
-                f1, tp, fp, fn, gospa_m = means
-                print(f"{size:8d}  {share:5.2f}  {f1:.3f}{tp:6.1f}{fp:6.1f}{fn:6.1f}  {gospa_m:.3f}")
+                f1, *others = (np.array([row[key] or 0 for row in totals]) for key in KEYS)
+                step = f1 - before.get(share, f1)
+                error = step.std(ddof=1) / np.sqrt(step.size) if step.size > 1 else float("nan")
+                tp, fp, fn, gospa_m = (values.mean() for values in others)
+                print(
+                    f"{size:8d}  {share:5.2f}  {f1.mean():.3f}  {step.mean():+.3f} ({error:.3f})"
+                    f"  {tp:6.1f}{fp:6.1f}{fn:6.1f}  {gospa_m:.3f}",
+                    flush=True,
+                )
+                before[share] = f1
 
 
 if __name__ == "__main__":

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
     Rows32 = NDArray[np.int32]
 
-_CELL_BITS = 20  # of a column or row: cells of zoom 20 at most
+CELL_BITS = 20  # of a column or row: cells of zoom 20 at most
 _COUNT_BITS = 20  # of the number of readers of a cell
-_EMPTY = -1
+EMPTY = -1
 _EDGE = 1e-6  # cells: two libraries' logarithms differ by less
 _READER = np.dtype(
     [
@@ -58,23 +58,26 @@ def index_readers(run: Ints, columns: Mapping[str, NDArray[np.generic]], fine_zo
     fine_zoom
         Zoom of the cells.
     """
-    key = _key(run, columns["cell_x"], columns["cell_y"])
+    cell_x, cell_y = columns["cell_x"].astype(np.int64), columns["cell_y"].astype(np.int64)
+    key = (run << 2 * CELL_BITS) | (cell_y << CELL_BITS) | cell_x
     order = np.argsort(key, kind="stable")
     reader = np.empty(key.size, _READER)
     for name in _READER.names or ():
         reader[name] = columns[name][order]
     keys, starts, counts = np.unique(key[order], return_index=True, return_counts=True)
-    slots = np.full((1 << max(4, int(2 * len(keys)).bit_length()), 2), _EMPTY, np.int64)
+    slots = np.full((1 << max(4, int(2 * len(keys)).bit_length()), 2), EMPTY, np.int64)
     _fill_slots(slots, keys, (starts << _COUNT_BITS) | counts)
     return Readers(slots, reader, 1 << fine_zoom, int(counts.max(initial=0)))
 
 
-def _key(run: Ints, cell_x: NDArray[np.generic], cell_y: NDArray[np.generic]) -> Ints:
-    return (run.astype(np.int64) << 2 * _CELL_BITS) | (cell_y.astype(np.int64) << _CELL_BITS) | cell_x.astype(np.int64)
+@njit(cache=True, nogil=True, inline="always")
+def cell_key(run: int, cell_x: int, cell_y: int) -> int:
+    """Return a number for a cell of a run; they sort by run, row and column."""
+    return int((np.int64(run) << 2 * CELL_BITS) | (np.int64(cell_y) << CELL_BITS) | np.int64(cell_x))
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _slot(key: int, mask: int) -> int:
+def slot_of(key: int, mask: int) -> int:
     """Spread keys over slots (Fibonacci hashing, Knuth 6.4)."""
     return int(np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)) & mask)
 
@@ -83,8 +86,8 @@ def _slot(key: int, mask: int) -> int:
 def _fill_slots(slots: Ints, keys: Ints, ranges: Ints) -> None:
     mask = len(slots) - 1
     for cell in range(keys.size):
-        slot = _slot(keys[cell], mask)
-        while slots[slot, 0] != _EMPTY:
+        slot = slot_of(keys[cell], mask)
+        while slots[slot, 0] != EMPTY:
             slot = (slot + 1) & mask
         slots[slot, 0], slots[slot, 1] = keys[cell], ranges[cell]
 
@@ -93,8 +96,8 @@ def _fill_slots(slots: Ints, keys: Ints, ranges: Ints) -> None:
 def _find(slots: Ints, key: int) -> int:
     """Return the readers of a cell, -1 if there are none."""
     mask = len(slots) - 1
-    slot = _slot(key, mask)
-    while slots[slot, 0] != key and slots[slot, 0] != _EMPTY:
+    slot = slot_of(key, mask)
+    while slots[slot, 0] != key and slots[slot, 0] != EMPTY:
         slot = (slot + 1) & mask
     return int(slots[slot, 1])
 
@@ -105,21 +108,18 @@ def _find_beside(slots: Ints, key: int, x: float, y: float) -> int:
     for step_x in range(-1, 2):
         for step_y in range(-1, 2):
             if math.floor(x + step_x * _EDGE) != math.floor(x) or math.floor(y + step_y * _EDGE) != math.floor(y):
-                found = _find(slots, key + (step_y << _CELL_BITS) + step_x)
-                if found != _EMPTY:
+                found = _find(slots, key + (step_y << CELL_BITS) + step_x)
+                if found != EMPTY:
                     return found
-    return _EMPTY
+    return EMPTY
 
 
-@njit(cache=True, nogil=True)
-def _places(lon_deg: Floats, lat_deg: Floats, side: int) -> tuple[Floats, Floats]:
-    """Return column and row of the cells, with the fraction, as `sql/tiles/located` does."""
-    x, y = np.empty(lon_deg.size), np.empty(lon_deg.size)
-    for i in range(lon_deg.size):
-        x[i] = (0.0 if lon_deg[i] == 180.0 else lon_deg[i] + 180.0) / 360.0 * side  # noqa: PLR2004  (180 is -180)
-        sine = math.sin(math.radians(lat_deg[i]))
-        y[i] = (0.5 - math.log((1.0 + sine) / (1.0 - sine)) / (4.0 * math.pi)) * side
-    return x, y
+@njit(cache=True, nogil=True, inline="always")
+def place(lon_deg: float, lat_deg: float, side: int) -> tuple[float, float]:
+    """Return column and row of a cell, with the fraction, as `sql/tiles/located` does."""
+    x = (0.0 if lon_deg == 180.0 else lon_deg + 180.0) / 360.0 * side  # noqa: PLR2004  (180 is -180)
+    sine = math.sin(math.radians(lat_deg))
+    return x, (0.5 - math.log((1.0 + sine) / (1.0 - sine)) / (4.0 * math.pi)) * side
 
 
 @njit(cache=True, nogil=True)
@@ -142,19 +142,19 @@ def deal(run: Ints, lon_deg: Floats, lat_deg: Floats, readers: Readers, n_batche
     Detection and reader of every copy, in the order of the detections, and (n_batches + 1,) where each batch starts
     when they are sorted by batch.
     """
-    x, y = _places(lon_deg, lat_deg, readers.side)
-    row, reader = np.empty(x.size * readers.most, np.int32), np.empty(x.size * readers.most, np.int32)
+    row, reader = np.empty(run.size * readers.most, np.int32), np.empty(run.size * readers.most, np.int32)
     start = np.zeros(n_batches + 1, np.int64)
     n = 0
-    for i in range(x.size):
-        key = int((np.int64(run[i]) << 2 * _CELL_BITS) | (np.int64(y[i]) << _CELL_BITS) | np.int64(x[i]))
+    for i in range(run.size):
+        x, y = place(lon_deg[i], lat_deg[i], readers.side)
+        key = cell_key(run[i], math.floor(x), math.floor(y))
         found = _find(readers.slots, key)
-        if found == _EMPTY:
-            found = _find_beside(readers.slots, key, x[i], y[i])
+        if found == EMPTY:
+            found = _find_beside(readers.slots, key, x, y)
         count = max(found, 0) & ((1 << _COUNT_BITS) - 1)
         for r in range(found >> _COUNT_BITS, (found >> _COUNT_BITS) + count):
             one = readers.reader[r]
-            if one.is_owned or (one.west <= x[i] <= one.east and one.north <= y[i] <= one.south):
+            if one.is_owned or (one.west <= x <= one.east and one.north <= y <= one.south):
                 row[n], reader[n] = i, r
                 n += 1
                 start[one.batch + 1] += 1

@@ -21,8 +21,8 @@ from geofleet.algorithms.joint_search import PriorMap
 from geofleet.algorithms.joint_tracks import places
 from geofleet.engines.whole import MAX_EXTENT_M
 from geofleet.errors import InputError
+from geofleet.tables.dealt import NEVER_BEGUN, NEVER_ENDED
 from geofleet.tables.schemas import EVIDENCE, NUISANCE
-from geofleet.tables.staging import NEVER_BEGUN, NEVER_ENDED
 from geofleet.tables.store import build_table, lonlat
 from geofleet.tables.tracks import Assumed, Fleet, fleet_arrays
 

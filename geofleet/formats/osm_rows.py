@@ -16,8 +16,9 @@ import pyarrow.compute as pc
 from geofleet.formats.osm_spool import NODE
 from geofleet.formats.osm_tags import is_sign_key, node_signs
 from geofleet.formats.positions import PlaceCheck
+from geofleet.tables.arrays import arrow_numbers, arrow_texts
 from geofleet.tables.schemas import SIGNS
-from geofleet.tables.store import arrow_numbers, arrow_texts, build_table
+from geofleet.tables.store import build_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from geofleet.errors import InputError
 from geofleet.tables.binding import bind_table
-from geofleet.tables.database import create_view, materialise
+from geofleet.tables.database import create_view, keep_table, materialise
 from geofleet.tables.schemas import PASSES
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def correct_passes(connection: duckdb.DuckDBPyConnection, detections: Path, pass
     if passes:
         bind_table(connection, PASSES, passes, name="driven", is_filled=True)
     else:
-        connection.from_arrow(PASSES.arrow().empty_table()).create("driven")
+        keep_table(connection, PASSES.arrow().empty_table(), "driven")
     create_view(connection, "aggregate/solved")
     n_usable, n_solved = connection.table("solved").aggregate("count(*), count(q_e)").fetchall()[0]
     if n_usable and not n_solved:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import duckdb
+import pyarrow as pa
 
 from geofleet.errors import InputError, TableError
 from geofleet.tables.schemas import GEOMETRY
@@ -13,6 +14,14 @@ from geofleet.tables.schemas import GEOMETRY
 if TYPE_CHECKING:
     from geofleet.tables.schemas import Schema
 
+_KINDS = {
+    "string": "VARCHAR",
+    "int64": "BIGINT",
+    "double": "DOUBLE",
+    "bool": "BOOLEAN",
+    "binary": "BLOB",
+    "timestamp[us, tz=UTC]": "TIMESTAMP WITH TIME ZONE",
+}
 _NUMBERS = ("INT", "DOUBLE", "FLOAT", "DECIMAL", "HUGEINT")
 
 
@@ -48,21 +57,30 @@ def bind_table(
     absent = [key for key in schema.partitions if key not in view.columns] if path.is_dir() else []
     values = [f"url_decode(regexp_extract(filename, '/{key}=([^/]*)/', 1)) AS {key}" for key in absent]
     if is_filled:
-        wanted = connection.from_arrow(schema.arrow().empty_table())
-        kinds = dict(zip(wanted.columns, wanted.types, strict=True))
-        values += [f"NULL::{kinds[c.name]} AS {c.name}" for c in schema.optional if c.name not in view.columns]
+        values += [f"NULL::{sql_kind(c.type)} AS {c.name}" for c in schema.optional if c.name not in view.columns]
     view = view.project(", ".join(["* EXCLUDE (filename)", *values]))
-    _check(connection, schema, view, path)
+    _check(schema, view, path)
     view.create_view(name or schema.name, replace=True)
 
 
-def _check(connection: duckdb.DuckDBPyConnection, schema: Schema, view: duckdb.DuckDBPyRelation, path: Path) -> None:
+def sql_kind(kind: pa.DataType) -> str:
+    """Return the type that DuckDB has for one of Arrow, of those that schemas use."""
+    if pa.types.is_struct(kind):
+        return f"STRUCT({', '.join(f'{field.name} {sql_kind(field.type)}' for field in kind)})"
+    if pa.types.is_map(kind):
+        return f"MAP({sql_kind(kind.key_type)}, {sql_kind(kind.item_type)})"
+    if pa.types.is_fixed_size_list(kind):
+        return f"{sql_kind(kind.value_type)}[{kind.list_size}]"
+    return _KINDS[str(kind)]
+
+
+def _check(schema: Schema, view: duckdb.DuckDBPyRelation, path: Path) -> None:
     where = f"{path}: table {schema.name}"
     todo = f"`geofleet schema {schema.name}` prints what it must hold."
     found = {name: str(kind) for name, kind in zip(view.columns, view.types, strict=True)}
     present = tuple(column.name for column in schema.optional if column.name in found)
-    wanted = connection.from_arrow(schema.arrow(present).empty_table())
-    for name, kind in zip(wanted.columns, map(str, wanted.types), strict=True):
+    for field in schema.arrow(present):
+        name, kind = field.name, sql_kind(field.type)
         if name == GEOMETRY:
             continue  # spatial reads it as GEOMETRY, not as the bytes it is stored in
         if name not in found:

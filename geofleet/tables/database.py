@@ -9,17 +9,21 @@ from __future__ import annotations
 import os
 import re
 import tempfile
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import duckdb
+import pyarrow.parquet as pq
 
 from geofleet.errors import QueryError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
+
+    import pyarrow as pa
 
 _HEADER = re.compile(r"^--\s*(why|reads|params|writes):\s*(.*)$")
 _PARAMETER = re.compile(r"\$([a-z_]\w*)")
@@ -155,17 +159,44 @@ def run(
     QueryError
         A parameter is missing or unknown, or DuckDB refuses the statement; the message names the file.
     """
+    text, texts = _bound(name, params or {})
+    with _naming(name):
+        return connection.execute(text, *texts)
+
+
+def _bound(name: str, given: Mapping[str, Any]) -> tuple[str, list[dict[str, str]]]:
+    """Return the text of a statement with its numbers filled in, and the texts that stay parameters, if any."""
     statement = load_sql(name)
-    given = dict(params or {})
     if set(given) != set(statement.params):
         raise QueryError(
             f"takes the parameters {', '.join(statement.params) or 'none'}, got {', '.join(sorted(given)) or 'none'}.",
             where=f"sql/{name}.sql",
         )
+    texts = {key: value for key, value in given.items() if isinstance(value, str)}
+    return _fill_in(statement.text, given), [texts] if texts else []
+
+
+@contextmanager
+def _naming(name: str) -> Iterator[None]:
+    """Raise what DuckDB raises as a QueryError that names the file."""
     try:
-        return connection.execute(statement.text, given)
+        yield
     except duckdb.Error as error:
         raise QueryError(f"{str(error).strip()}", where=f"sql/{name}.sql") from error
+
+
+def _fill_in(text: str, given: Mapping[str, Any]) -> str:
+    """Write numbers and truth values into a statement; texts stay parameters.
+
+    DuckDB's client imports pandas to look at a parameter, whatever it is: half a second and 60 MB for every step.
+    """
+    literals = {key: _literal(value) for key, value in given.items() if isinstance(value, bool | int | float)}
+    return _PARAMETER.sub(lambda match: literals.get(match[1], match[0]), text)
+
+
+def _literal(value: float) -> str:
+    """Return a number as SQL; one with a point would be a DECIMAL, with other rules of rounding."""
+    return f"'{value!r}'::DOUBLE" if isinstance(value, float) else f"({value})".lower()
 
 
 def create_view(connection: duckdb.DuckDBPyConnection, name: str, *, alias: str = "") -> None:
@@ -175,5 +206,14 @@ def create_view(connection: duckdb.DuckDBPyConnection, name: str, *, alias: str 
 
 def materialise(connection: duckdb.DuckDBPyConnection, name: str, params: Mapping[str, Any] | None = None) -> None:
     """Keep the result of a statement as a table of its file's name."""
-    table = run(connection, name, params).to_arrow_table()
-    connection.from_arrow(table).create(name.rpartition("/")[2])
+    text, texts = _bound(name, params or {})
+    with _naming(name):
+        connection.sql(text, params=texts[0] if texts else None).create(name.rpartition("/")[2])
+
+
+def keep_table(connection: duckdb.DuckDBPyConnection, table: pa.Table, name: str) -> None:
+    """Copy a small table into the database, by way of a file: what comes from Arrow imports pandas too."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "table.parquet"
+        pq.write_table(table, path)
+        connection.read_parquet(str(path)).create(name)

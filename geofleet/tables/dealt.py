@@ -10,14 +10,15 @@ import numpy as np
 from geofleet.algorithms.dealing import deal, index_readers, take_rows, unpack_rows
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
-    import pyarrow as pa
     from numpy.typing import NDArray
 
     Columns = dict[str, NDArray[Any]]
     Ints = NDArray[np.int64]
 
+NEVER_BEGUN, NEVER_ENDED = np.iinfo(np.int64).max, np.iinfo(np.int64).min  # times that are missing, µs
 _HASHES_OF_PASSES = "pass_hash.npy"
 _FLOATS = ("lon", "lat", "var_m2", "class_confidence")
 _WHOLE = ("track_id", "t_first_us", "t_last_us")
@@ -34,30 +35,27 @@ _ROW = np.dtype(
 
 
 class Dealer:
-    """Deals blocks of rows (`sql/aggregate/coded`) to one file a batch below a folder.
+    """Deals blocks of rows (the columns of `sql/aggregate/coded`) to one file a batch below a folder.
 
     Parameters
     ----------
     folder
         Where the batches go, `batch_path(folder, number)`.
     readers
-        The table `sql/tiles/readers`.
+        The columns of `sql/tiles/readers`.
     fine_zoom
         Zoom of the cells.
     run_of_tile, run_of_pass
         Number of the run of every tile and of every pass.
     """
 
-    def __init__(
-        self, folder: Path, readers: pa.Table, *, fine_zoom: int, run_of_tile: Ints, run_of_pass: Ints
-    ) -> None:
-        columns = {name: readers[name].to_numpy() for name in readers.column_names if name != "run_id"}
-        self._readers = index_readers(run_of_tile[columns["tile_code"]], columns, fine_zoom)
-        self._n_batches = int(columns["batch"].max(initial=-1)) + 1
+    def __init__(self, folder: Path, readers: Columns, *, fine_zoom: int, run_of_tile: Ints, run_of_pass: Ints) -> None:
+        self._readers = index_readers(run_of_tile[readers["tile_code"]], readers, fine_zoom)
+        self._n_batches = int(readers["batch"].max(initial=-1)) + 1
         self._run_of_pass, self._folder = run_of_pass, folder
         self._dealt = np.empty(0, _ROW)
 
-    def deal_all(self, blocks: pa.RecordBatchReader) -> None:
+    def deal_all(self, blocks: Iterable[Columns]) -> None:
         """Deal all blocks; the next one is made while one is dealt."""
         with ThreadPoolExecutor(1) as pool:
             dealing = None
@@ -68,8 +66,7 @@ class Dealer:
             if dealing:
                 dealing.result()
 
-    def _deal(self, block: pa.RecordBatch) -> None:
-        column = {name: block.column(name).to_numpy(zero_copy_only=False) for name in block.schema.names}
+    def _deal(self, column: Columns) -> None:
         run = self._run_of_pass[column["pass_code"]]
         row, reader, start = deal(run, column["lon"], column["lat"], self._readers, self._n_batches)
         if (

@@ -10,8 +10,9 @@ import numpy as np
 import pyarrow as pa
 
 from geofleet.algorithms.fusion import ID_SHIFT, name_hashes
+from geofleet.tables.arrays import arrow_numbers, arrow_texts, arrow_times
+from geofleet.tables.dealt import NEVER_BEGUN, NEVER_ENDED
 from geofleet.tables.schemas import SIGNS
-from geofleet.tables.staging import NEVER_BEGUN, NEVER_ENDED
 from geofleet.tables.store import build_table
 from geofleet.taxonomy.reader import load_taxonomy
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 PIECE_ROWS = 30_000  # signs built and written at a time: tens of megabytes
 _NUMBERED_CLASS = re.compile(r"(?P<concept>[^:]+):(?P<value>-?\d+(\.\d+)?)(?P<unit>\D*)")
+_MEASURED = ("var_e_m2", "var_n_m2", "cov_en_m2", "class_confidence", "existence")
 _FUSED = (
     *("var_e_m2", "var_n_m2", "cov_en_m2", "class_confidence", "n_passes", "n_detections"),
     *("run_id", "method", "n_vehicles"),
@@ -93,18 +95,17 @@ def _by_name(clusters: Columns, rows: Ints) -> Ints:
 
 
 def _piece(kept: Columns, names: NDArray[np.bytes_], labels: Labels) -> pa.Table:
-    runs = pa.array(labels.run_ids, pa.string()).take(pa.array(kept["run_code"]))
+    runs = arrow_texts(labels.run_ids).take(arrow_numbers(kept["run_code"]))
     columns: dict[str, Any] = {
         "sign_id": _texts(names),
         "kind": "main",
         **_class_columns(labels.classes, kept["class_code"]),
         "source": "geofleet",
         "source_ref": runs,
-        "first_seen": _times(kept["t_first_us"], NEVER_BEGUN),
-        "last_seen": _times(kept["t_last_us"], NEVER_ENDED),
-        **_or_null(kept, ("var_e_m2", "var_n_m2", "cov_en_m2", "class_confidence")),
-        **{name: pa.array(kept[name]) for name in ("existence",) if name in kept},
-        **{name: pa.array(kept[name]) for name in ("n_passes", "n_detections", "n_opportunities") if name in kept},
+        "first_seen": arrow_times(kept["t_first_us"], NEVER_BEGUN),
+        "last_seen": arrow_times(kept["t_last_us"], NEVER_ENDED),
+        **{name: arrow_numbers(kept[name].astype(np.float64)) for name in _MEASURED if name in kept},
+        **{name: arrow_numbers(kept[name]) for name in ("n_passes", "n_detections", "n_opportunities") if name in kept},
         "run_id": runs,
         "method": labels.method,
         "n_vehicles": labels.n_vehicles[kept["run_code"]],
@@ -124,35 +125,26 @@ def _texts(names: NDArray[np.bytes_]) -> pa.Array:
 
 def _class_columns(classes: Sequence[str], class_code: Ints) -> dict[str, pa.Array]:
     """Return concept, value, unit and class; a fleet reports classes, so the raw code is the class."""
-    codes = pa.array(class_code)
+    codes = arrow_numbers(class_code)
     meanings = [_meaning(name) for name in classes]
-    names = pa.array(classes, pa.string()).take(codes)
+    names = arrow_texts(classes).take(codes)
     return {
-        **{
-            name: pa.array([meaning[name] for meaning in meanings], kind).take(codes)
-            for name, kind in (("concept", pa.string()), ("value", pa.float64()), ("unit", pa.string()))
-        },
+        "concept": arrow_texts([concept for concept, _, _ in meanings]).take(codes),
+        "value": arrow_numbers(np.array([value for _, value, _ in meanings], np.float64)).take(codes),
+        "unit": arrow_texts([unit for _, _, unit in meanings]).take(codes),
         "sign_class": names,
         "raw_code": names,
     }
 
 
-def _or_null(columns: Columns, names: Sequence[str]) -> dict[str, pa.Array]:
-    return {name: pa.array(columns[name].astype(np.float64), from_pandas=True) for name in names}
-
-
-def _times(microseconds: Ints, missing: int) -> pa.Array:
-    return pa.array(microseconds, mask=microseconds == missing).cast(pa.timestamp("us", tz="UTC"))
-
-
-def _meaning(sign_class: str) -> dict[str, Any]:
+def _meaning(sign_class: str) -> tuple[str, float, str | None]:
     """Return concept, value and unit of a class: `concept`, `concept:number`, or with a unit other than the concept's.
 
-    Any other text, such as `raw:<code>`, is its own concept.
+    Any other text, such as `raw:<code>`, is its own concept; what has no value has NaN.
     """
     concepts = load_taxonomy().concepts
     found = _NUMBERED_CLASS.fullmatch(sign_class)
     if not found or found["concept"] == "raw":
-        return {"concept": sign_class, "value": None, "unit": None}
+        return sign_class, float("nan"), None
     own = concepts[found["concept"]].unit if found["concept"] in concepts else ""
-    return {"concept": found["concept"], "value": float(found["value"]), "unit": found["unit"] or own or None}
+    return found["concept"], float(found["value"]), found["unit"] or own or None

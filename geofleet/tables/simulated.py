@@ -9,8 +9,9 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
+from geofleet.tables.arrays import arrow_numbers, arrow_texts
 from geofleet.tables.schemas import BBOX, DETECTIONS, GEOMETRY, PASSES, REFERENCE, RUNS, TRUTH
-from geofleet.tables.store import arrow_numbers, arrow_texts, build_table, lonlat
+from geofleet.tables.store import build_table, lonlat
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

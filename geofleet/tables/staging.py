@@ -4,28 +4,31 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 
+from geofleet.tables.arrays import numpy_numbers
 from geofleet.tables.biases import BiasSummary, correct_passes
 from geofleet.tables.binding import bind_table
-from geofleet.tables.database import create_view, materialise, run
+from geofleet.tables.database import create_view, keep_table, load_sql, materialise, run
 from geofleet.tables.dealt import Dealer, write_pass_hashes
+from geofleet.tables.plain import BLOCK_ROWS, MAX_ID_BITS, Survey, coded_blocks, survey
 from geofleet.tables.schemas import DETECTIONS
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     import duckdb
+    from numpy.typing import NDArray
+
+    Columns = dict[str, NDArray[Any]]
 
 FINE_ZOOM = 18  # cells of 100 m at 50 degrees: hot tiles are split down to these
 _CELL_M = 3_400_000.0  # a cell of zoom 0 at 85.05 degrees is at least this wide
 MAX_BATCHES = 500  # files that are written by turns
-BLOCK_ROWS = 250_000  # rows that are sorted into their batches at a time
-_MAX_ID_BITS = 1 << 29  # 64 MB of track ids
-NEVER_BEGUN, NEVER_ENDED = np.iinfo(np.int64).max, np.iinfo(np.int64).min  # times that are missing, µs
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +83,9 @@ def stage_detections(
         A column is missing or mistyped.
     """
     fine_zoom = max(zoom, FINE_ZOOM)
-    judge_detections(connection, detections, n_vehicles=n_vehicles)
+    plain = judge_detections(
+        connection, detections, n_vehicles=n_vehicles, fine_zoom=None if correct_bias else fine_zoom
+    )
     found = judged(connection)
     batch_rows = max(batch_rows, found.n_detections // MAX_BATCHES)
     bias = correct_passes(connection, detections, passes) if correct_bias else None
@@ -90,15 +95,18 @@ def stage_detections(
         create_view(connection, "aggregate/chosen")
     else:
         connection.table("placed").create_view("chosen")
-    materialise(connection, "aggregate/classes")
-    materialise(connection, "tiles/counts", {"fine_zoom": fine_zoom})
+    classes = plain.classes if plain else _number_classes(connection)
+    if plain and not n_vehicles:
+        keep_table(connection, plain.counts, "counts")
+    else:
+        materialise(connection, "tiles/counts", {"fine_zoom": fine_zoom})
     materialise(connection, "tiles/leaves", {"zoom": zoom, "fine_zoom": fine_zoom, "batch_rows": batch_rows})
     materialise(connection, "tiles/assign", {"batch_rows": batch_rows})
-    _deal(connection, folder, fine_zoom=fine_zoom, halo_m=halo_m)
+    _deal(connection, folder, plain, fine_zoom=fine_zoom, halo_m=halo_m)
     return Staged(
         folder=folder,
         tiles=connection.table("assign").to_arrow_table(),
-        classes=tuple(connection.table("classes").to_arrow_table()["sign_class"].to_pylist()),
+        classes=classes,
         fleet=found.fleet,
         rejected=found.rejected,
         n_detections=found.n_detections,
@@ -115,8 +123,12 @@ class Judged:
     n_detections: int
 
 
-def judge_detections(connection: duckdb.DuckDBPyConnection, detections: Path, *, n_vehicles: int) -> None:
+def judge_detections(
+    connection: duckdb.DuckDBPyConnection, detections: Path, *, n_vehicles: int, fine_zoom: int | None = None
+) -> Survey | None:
     """Make the views and tables `judged`, `reporting`, `copies`, `fleet`, `passes` and `usable` of the detections.
+
+    With `fine_zoom`, return what a plain table holds, counted in cells of that zoom.
 
     Raises
     ------
@@ -125,10 +137,17 @@ def judge_detections(connection: duckdb.DuckDBPyConnection, detections: Path, *,
     """
     bind_table(connection, DETECTIONS, detections, is_filled=True)
     create_view(connection, "aggregate/judged")
-    _report_passes(connection)
+    plain = survey(detections, fine_zoom) if fine_zoom else None
+    if plain:
+        keep_table(connection, plain.reporting, "reporting")
+    else:
+        _report_passes(connection)
+    materialise(connection, "aggregate/suspects")
+    _find_copies(connection)
     materialise(connection, "aggregate/fleet", {"n_vehicles": n_vehicles})
     materialise(connection, "aggregate/passes")
     _select_usable(connection)
+    return plain
 
 
 def _select_usable(connection: duckdb.DuckDBPyConnection) -> None:
@@ -156,13 +175,25 @@ def judged(connection: duckdb.DuckDBPyConnection) -> Judged:
 
 
 def _report_passes(connection: duckdb.DuckDBPyConnection) -> None:
-    """Count what each pass reports, and find the rows that repeat a key."""
+    """Count what each pass reports."""
     low, high, n_passes = run(connection, "aggregate/ranges").fetchall()[0]
-    is_narrow = low is not None and (high - low + 1) * n_passes <= _MAX_ID_BITS
+    is_narrow = low is not None and (high - low + 1) * n_passes <= MAX_ID_BITS
     ids = {"low": low if is_narrow else 0, "high": high if is_narrow else 0, "is_narrow": is_narrow}
     materialise(connection, "aggregate/reporting", ids)
-    materialise(connection, "aggregate/suspects")
-    materialise(connection, "aggregate/copies")
+
+
+def _find_copies(connection: duckdb.DuckDBPyConnection) -> None:
+    """Find the rows that repeat a key; the detections are scanned for them only where there may be any."""
+    if connection.table("suspects").aggregate("count(*)").fetchall()[0][0]:
+        materialise(connection, "aggregate/copies")
+    else:
+        connection.sql(load_sql("aggregate/copies").text).limit(0).create("copies")
+
+
+def _number_classes(connection: duckdb.DuckDBPyConnection) -> tuple[str, ...]:
+    """Return the classes in the order of their numbers."""
+    materialise(connection, "aggregate/classes")
+    return tuple(connection.table("classes").to_arrow_table()["sign_class"].to_pylist())
 
 
 def _rejected(connection: duckdb.DuckDBPyConnection, *, n_invalid: int) -> pa.Table:
@@ -173,15 +204,28 @@ def _rejected(connection: duckdb.DuckDBPyConnection, *, n_invalid: int) -> pa.Ta
     return pa.concat_tables([run(connection, "checks/detections_invalid").to_arrow_table(), copies])
 
 
-def _deal(connection: duckdb.DuckDBPyConnection, folder: Path, *, fine_zoom: int, halo_m: float) -> None:
+def _deal(
+    connection: duckdb.DuckDBPyConnection, folder: Path, plain: Survey | None, *, fine_zoom: int, halo_m: float
+) -> None:
     """Write every detection to the batches whose tiles read it."""
     reach = {"fine_zoom": fine_zoom, "halo_m": halo_m, "n_around": math.ceil(halo_m / _CELL_M * 2.0**fine_zoom) or 1}
     materialise(connection, "tiles/readers", reach)
-    readers = connection.table("readers").to_arrow_table()
+    found = connection.sql("SELECT * EXCLUDE (run_id) FROM readers").fetchnumpy()
+    readers = {name: np.asarray(values) for name, values in found.items()}
     tiles = connection.sql("SELECT run_id FROM assign ORDER BY tile_code").fetchnumpy()
     passes = connection.sql("SELECT DISTINCT pass_code, run_id, pass_hash FROM passes ORDER BY pass_code").fetchnumpy()
     run_ids, run_of_pass = np.unique(np.asarray(passes["run_id"], str), return_inverse=True)
     write_pass_hashes(folder, np.asarray(passes["pass_hash"], np.uint64))
     run_of_tile = np.searchsorted(run_ids, np.asarray(tiles["run_id"], str))
     dealer = Dealer(folder, readers, fine_zoom=fine_zoom, run_of_tile=run_of_tile, run_of_pass=run_of_pass)
-    dealer.deal_all(run(connection, "aggregate/coded").to_arrow_reader(BLOCK_ROWS))
+    dealer.deal_all(_plain_blocks(connection, plain) if plain else _blocks(connection))
+
+
+def _plain_blocks(connection: duckdb.DuckDBPyConnection, plain: Survey) -> Iterator[Columns]:
+    codes = connection.sql("SELECT run_id, vehicle_id, pass_id, pass_code FROM passes").fetchall()
+    return coded_blocks(plain, {(run_id, vehicle_id, pass_id): code for run_id, vehicle_id, pass_id, code in codes})
+
+
+def _blocks(connection: duckdb.DuckDBPyConnection) -> Iterator[Columns]:
+    for block in run(connection, "aggregate/coded").to_arrow_reader(BLOCK_ROWS):
+        yield {name: numpy_numbers(block.column(name)) for name in block.schema.names}

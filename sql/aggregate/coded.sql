@@ -1,5 +1,6 @@
 -- why: the detections of the vehicles used, each with the numbers of its pass and class; a missing number is NaN, a missing
---      time one that no minimum or maximum takes
+--      time one that no minimum or maximum takes. Of one plain file `geofleet/tables/plain.py` says the same, and a test
+--      demands the same rows
 -- reads: @aggregate/chosen, @aggregate/passes, @aggregate/classes
 -- params: none
 -- writes: pass_code INTEGER, track_id BIGINT, class_code INTEGER, lon DOUBLE, lat DOUBLE, var_m2 DOUBLE,

@@ -1,6 +1,7 @@
 -- why: what every pass reports: rows, usable rows and, where a bit string of $low to $high can hold them, different track
 --      ids. Vehicles and passes, the count of bad rows and the search for repeated keys all start from here, so that the
---      detections are not scanned for each
+--      detections are not scanned for each. Of one plain file `geofleet/tables/plain.py` says the same, and a test
+--      demands the same rows
 -- reads: @aggregate/judged
 -- params: $low (bigint, smallest track id), $high (bigint, largest track id), $is_narrow (boolean, ids fit bit strings)
 -- writes: run_id VARCHAR, vehicle_id VARCHAR, pass_id VARCHAR, n_rows BIGINT, n_usable BIGINT, n_track_ids BIGINT

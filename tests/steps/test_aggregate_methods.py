@@ -195,8 +195,8 @@ def test_support_is_relative_to_the_passes_that_had_the_place_in_view(tmp_path):
 def test_repeated_keys_are_found_however_far_apart_the_ids_are(tmp_path, monkeypatch):
     table = detections()
     twice = pa.concat_tables([table, table.slice(3, 2)])
-    for bits in (staging._MAX_ID_BITS, 0):
-        monkeypatch.setattr(staging, "_MAX_ID_BITS", bits)
+    for bits in (staging.MAX_ID_BITS, 0):
+        monkeypatch.setattr(staging, "MAX_ID_BITS", bits)
         result = run_on(tmp_path, twice)
         assert (result.n_rejected, result.n_used, result.n_signs) == (2, 80, 4)
 

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 
 from geofleet.algorithms.geodesy import EnuFrame
-from geofleet.tables.database import connect, create_view, run
+from geofleet.tables.database import connect, create_view, materialise, run
 from geofleet.tables.dealt import batch_path, read_rows
 from geofleet.tables.schemas import DETECTIONS
 from geofleet.tables.staging import stage_detections
@@ -39,6 +39,7 @@ def test_the_kernel_deals_as_the_statement_says(tmp_path, place_deg, zoom, batch
     options = {"zoom": zoom, "halo_m": 9.0, "batch_rows": batch_rows, "n_vehicles": 0}
     staged = stage_detections(connection, tmp_path / "d.parquet", tmp_path, **options)
     fine_zoom = max(zoom, 18)
+    materialise(connection, "aggregate/classes")
     create_view(connection, "aggregate/coded")
     located = run(connection, "tiles/located", {"fine_zoom": fine_zoom}).to_arrow_table()
     connection.from_arrow(located).create("located")

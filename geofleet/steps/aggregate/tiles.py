@@ -10,6 +10,7 @@ import pyarrow as pa
 from geofleet.algorithms.tiling import halo_m
 from geofleet.engines.batches import TileTask, cluster_batch, concatenate, fuse_open, splitter
 from geofleet.engines.local import run_tasks
+from geofleet.tables.arrays import numpy_numbers
 from geofleet.tables.database import connect
 from geofleet.tables.dealt import batch_path
 from geofleet.tables.staging import Staged, stage_detections
@@ -74,7 +75,7 @@ def cluster_tiles_of(
 def _tile_tasks(staged: Staged, settings: AggregateConfig) -> list[TileTask]:
     """Return one task a batch; its tiles are consecutive."""
     names, runs = staged.tiles["tile"].to_pylist(), run_codes(staged).tolist()
-    numbers, starts = np.unique(staged.tiles["batch"].to_numpy(), return_index=True)
+    numbers, starts = np.unique(numpy_numbers(staged.tiles["batch"].combine_chunks()), return_index=True)
     stops = np.append(starts, len(names))[1:]
     return [
         TileTask(
