@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geofleet.algorithms.pose_errors import gauss_markov, wrong_fixes
-from geofleet.algorithms.sensing_kernels import in_view
+from geofleet.algorithms.sensing_kernels import in_view, project
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -351,6 +351,5 @@ def ghost_tracks(
 
 def projected(seen: Sightings, reported: Poses) -> tuple[Floats, Floats]:
     """Return reported positions p = pose + R(heading) d (cos θ, sin θ) (paper, eq. 6), and directions of view."""
-    azimuth_rad = reported.heading_rad[seen.frame] + seen.bearing_rad
-    ray = np.column_stack((np.cos(azimuth_rad), np.sin(azimuth_rad)))
-    return reported.xy_m[seen.frame] + seen.range_m[:, None] * ray, azimuth_rad
+    xy_m, azimuth_rad = project(seen.frame, seen.range_m, seen.bearing_rad, reported.xy_m, reported.heading_rad)
+    return xy_m, azimuth_rad

@@ -125,3 +125,17 @@ def by_frame(first: Ints, second: Ints) -> Ints:
         else:
             order[k], j = len(first) + j, j + 1
     return order
+
+
+@njit(cache=True, nogil=True)
+def project(
+    frame: Ints, range_m: Floats, bearing_rad: Floats, pose_xy_m: Floats, heading_rad: Floats
+) -> tuple[Floats, Floats]:
+    """Return pose + R(heading) d (cos θ, sin θ), shape (n, 2), and the directions heading + θ, shape (n,)."""
+    xy_m, azimuth_rad = np.empty((len(frame), 2)), np.empty(len(frame))
+    for i in range(len(frame)):
+        at, azimuth = frame[i], heading_rad[frame[i]] + bearing_rad[i]
+        xy_m[i, 0] = pose_xy_m[at, 0] + range_m[i] * np.cos(azimuth)  # sine and cosine come from one call
+        xy_m[i, 1] = pose_xy_m[at, 1] + range_m[i] * np.sin(azimuth)
+        azimuth_rad[i] = azimuth
+    return xy_m, azimuth_rad

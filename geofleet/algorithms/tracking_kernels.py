@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
 
-from geofleet.algorithms.assignment import NONE, _assign, _Graph  # the compiled core: one call a frame
+from geofleet.algorithms.assignment import NONE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -15,6 +15,58 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
     Flags = NDArray[np.bool_]
+
+
+_inlined = njit(cache=True, nogil=True, inline="always")
+"""Compiles what runs for every frame into its caller: a call hands over each part of every array, which cost as much as
+the work did."""
+
+
+class _Room(NamedTuple):
+    """Where an association is worked out, made once for all frames: to allocate would cost more than to decide.
+
+    A column stands for a point of `b` or, after these, for one member that stays without partner.
+    """
+
+    partner: Ints  # of each point of `a`, counted from the first of `b`, or NONE
+    holder: Ints  # the last point of `a` that is nearest to one of `b`
+    member: Ints  # the points of `a` that are decided together
+    is_member: Flags  # of these or of those before
+    row_price: Floats
+    column_price: Floats
+    row_of_column: Ints
+    distance: Floats  # of a column from the row that the search started at
+    reached_from: Ints  # the column that a column was reached from
+    is_settled: Flags
+
+
+@njit(cache=True, nogil=True)
+def _room(n_a: int, n_b: int) -> _Room:
+    n = n_a + n_b
+    return _Room(
+        np.empty(n_a, np.int64),
+        np.empty(n_b, np.int64),
+        np.empty(n_a, np.int64),
+        np.empty(n_a, np.bool_),
+        np.empty(n_a),
+        np.empty(n),
+        np.empty(n, np.int64),
+        np.empty(n),
+        np.empty(n, np.int64),
+        np.empty(n, np.bool_),
+    )
+
+
+class _Pairs(NamedTuple):
+    """What is paired: some rows of `a` with those of `b` from `first` to `last`; to slice them would cost more."""
+
+    a_xy_m: Floats
+    rows: Ints
+    n_rows: int
+    b_xy_m: Floats
+    first: int
+    last: int
+    gate_m: float
 
 
 @njit(cache=True, nogil=True)
@@ -25,66 +77,45 @@ def match_within(a_xy_m: Floats, b_xy_m: Floats, gate_m: float) -> Ints:
     most pairs is taken and, of those, the one with the least total distance. Where the nearest partners of all points
     are different ones, that is it; what is contested is decided by the Hungarian method.
     """
-    rows, partner, holder = np.arange(len(a_xy_m)), np.empty(len(a_xy_m), np.int64), np.full(len(b_xy_m), NONE)
-    _match(a_xy_m, rows, len(rows), b_xy_m, 0, len(b_xy_m), gate_m, partner, holder)
-    return partner
+    room = _room(len(a_xy_m), len(b_xy_m))
+    _match(_Pairs(a_xy_m, np.arange(len(a_xy_m)), len(a_xy_m), b_xy_m, 0, len(b_xy_m), gate_m), room)
+    return room.partner
 
 
-@njit(cache=True, nogil=True)
-def _match(  # noqa: PLR0917 - numba takes no keyword-only arguments
-    a_xy_m: Floats,
-    rows: Ints,
-    n_rows: int,
-    b_xy_m: Floats,
-    first: int,
-    last: int,
-    gate_m: float,
-    partner: Ints,
-    holder: Ints,
-) -> None:
-    """Write the partner of each of the first `n_rows` rows of `a`, counted from `first`, or `NONE`.
-
-    `b` is rows `first` up to `last`; `holder` is room for as many. Slices would cost more than what is done with them.
-    """
+@_inlined
+def _match(pairs: _Pairs, room: _Room) -> None:
+    """Write the partner of each row of `a`, or `NONE`, into the room."""
     is_contested = False
-    for j in range(last - first):
-        holder[j] = NONE
-    for k in range(n_rows):
-        x, y, nearest, found = a_xy_m[rows[k], 0], a_xy_m[rows[k], 1], gate_m * gate_m, NONE
-        for i in range(first, last):
-            dx, dy = x - b_xy_m[i, 0], y - b_xy_m[i, 1]
+    for j in range(pairs.last - pairs.first):
+        room.holder[j] = NONE
+    for k in range(pairs.n_rows):
+        x, y = pairs.a_xy_m[pairs.rows[k], 0], pairs.a_xy_m[pairs.rows[k], 1]
+        nearest, found = pairs.gate_m * pairs.gate_m, NONE
+        for i in range(pairs.first, pairs.last):
+            dx, dy = x - pairs.b_xy_m[i, 0], y - pairs.b_xy_m[i, 1]
             square = dx * dx + dy * dy
             if square < nearest:
-                nearest, found = square, i - first
-        partner[k] = found
+                nearest, found = square, i - pairs.first
+        room.partner[k] = found
         if found != NONE:
-            is_contested |= holder[found] != NONE
-            holder[found] = k
+            is_contested |= room.holder[found] != NONE
+            room.holder[found] = k
     if is_contested:
-        _decide(a_xy_m[rows[:n_rows]], b_xy_m[first:last], gate_m, partner)
+        _decide(pairs, room)
 
 
-@njit(cache=True, nogil=True)
-def _decide(a_xy_m: Floats, b_xy_m: Floats, gate_m: float, partner: Ints) -> None:
+@_inlined
+def _decide(pairs: _Pairs, room: _Room) -> None:
     """Give the contested points of `a` their partners: each component of the gate graph that is contested, whole."""
-    n_a, n_b = len(a_xy_m), len(b_xy_m)
-    distance = np.empty((n_a, n_b))
-    for k in range(n_a):
-        for j in range(n_b):
-            dx, dy = a_xy_m[k, 0] - b_xy_m[j, 0], a_xy_m[k, 1] - b_xy_m[j, 1]
-            square = dx * dx + dy * dy
-            distance[k, j] = np.sqrt(square) if square < gate_m * gate_m else np.inf
-    is_done = np.zeros(n_a, np.bool_)
-    for k in range(n_a):
-        if not is_done[k] and _is_contested(partner, n_a, k):
-            rows = _component(distance, k, is_done)
-            if len(rows) == 2:  # noqa: PLR2004 - two plates on a pole: nearly always
-                _decide_two(distance, rows[0], rows[1], partner)
-            else:
-                _decide_many(distance, rows, gate_m, partner)
+    for k in range(pairs.n_rows):
+        room.is_member[k] = False
+    for k in range(pairs.n_rows):
+        if not room.is_member[k] and _is_contested(room.partner, pairs.n_rows, k):
+            n_members = _component(pairs, room, k)
+            _assign_members(pairs, room, n_members)
 
 
-@njit(cache=True, nogil=True)
+@_inlined
 def _is_contested(partner: Ints, n_rows: int, row: int) -> bool:
     n_wanting = 0
     for k in range(n_rows):
@@ -92,51 +123,85 @@ def _is_contested(partner: Ints, n_rows: int, row: int) -> bool:
     return n_wanting > 1
 
 
-@njit(cache=True, nogil=True)
-def _component(distance: Floats, start: int, is_in: Flags) -> Ints:
-    """Return the rows that `start` reaches over pairs of finite distance, itself first, and mark them in `is_in`."""
-    n_rows, n_columns = distance.shape
-    rows, is_reached = np.empty(n_rows, np.int64), np.zeros(n_columns, np.bool_)
-    rows[0], is_in[start], n, done = start, True, 1, 0
+@_inlined
+def _gated(pairs: _Pairs, k: int, j: int) -> float:
+    """Return the distance of a point of `a` from one of `b`, infinite when it is not below the gate."""
+    at, to = pairs.rows[k], pairs.first + j
+    dx, dy = pairs.a_xy_m[at, 0] - pairs.b_xy_m[to, 0], pairs.a_xy_m[at, 1] - pairs.b_xy_m[to, 1]
+    square = dx * dx + dy * dy
+    return float(np.sqrt(square)) if square < pairs.gate_m * pairs.gate_m else np.inf
+
+
+@_inlined
+def _component(pairs: _Pairs, room: _Room, start: int) -> int:
+    """Write the rows that `start` reaches over pairs within the gate, itself first; return how many they are."""
+    room.member[0], room.is_member[start], n, done = start, True, 1, 0
     while done < n:
-        for j in range(n_columns):
-            if distance[rows[done], j] < np.inf and not is_reached[j]:
-                is_reached[j] = True
-                for k in range(n_rows):
-                    if not is_in[k] and distance[k, j] < np.inf:
-                        rows[n], is_in[k] = k, True
+        for j in range(pairs.last - pairs.first):
+            if _gated(pairs, room.member[done], j) < np.inf:
+                for k in range(pairs.n_rows):
+                    if not room.is_member[k] and _gated(pairs, k, j) < np.inf:
+                        room.member[n], room.is_member[k] = k, True
                         n += 1
         done += 1
-    return rows[:n]
+    return n
 
 
-@njit(cache=True, nogil=True)
-def _decide_two(distance: Floats, one: int, two: int, partner: Ints) -> None:
-    """Try every pair of columns; when no two can be had, the nearer row takes the only one."""
-    best = np.inf
-    for i in range(distance.shape[1]):
-        for j in range(distance.shape[1]):
-            total = distance[one, i] + distance[two, j]
-            if i != j and total < best:
-                best, partner[one], partner[two] = total, i, j
-    if best == np.inf:
-        partner[two if distance[one].min() <= distance[two].min() else one] = NONE
+@_inlined
+def _assign_members(pairs: _Pairs, room: _Room, n_members: int) -> None:
+    """Assign by shortest augmenting paths: one pair less never pays, for that costs more than all pairs together."""
+    n_b = pairs.last - pairs.first
+    stay_out = pairs.gate_m * (min(n_members, n_b) + 1)
+    for j in range(n_b + n_members):
+        room.column_price[j], room.row_of_column[j] = 0.0, NONE
+    for m in range(n_members):
+        room.row_price[m] = 0.0
+        end = _search(pairs, room, m, n_members, stay_out)
+        _reprice(room, m, end, n_b + n_members)
+        while end != NONE:  # each column on the path takes the row that held the one before
+            before = room.reached_from[end]
+            room.row_of_column[end] = m if before == NONE else room.row_of_column[before]
+            end = before
+    for m in range(n_members):
+        room.partner[room.member[m]] = NONE
+    for j in range(n_b):
+        if room.row_of_column[j] != NONE:
+            room.partner[room.member[room.row_of_column[j]]] = j
 
 
-@njit(cache=True, nogil=True)
-def _decide_many(distance: Floats, rows: Ints, gate_m: float, partner: Ints) -> None:
-    """Decide by the Hungarian method: one pair less never pays, for to stay out costs more than all pairs together."""
-    n_columns = distance.shape[1]
-    start, n_pairs = np.zeros(len(rows) + 1, np.int64), 0
-    column, cost = np.empty(len(rows) * n_columns, np.int64), np.empty(len(rows) * n_columns)
-    for k in range(len(rows)):
-        for j in range(n_columns):
-            if distance[rows[k], j] < np.inf:
-                column[n_pairs], cost[n_pairs] = j, distance[rows[k], j]
-                n_pairs += 1
-        start[k + 1] = n_pairs
-    stay_out = np.full(len(rows), gate_m * (min(len(rows), n_columns) + 1))
-    partner[rows] = _assign(_Graph(start, column[:n_pairs], cost[:n_pairs], stay_out), n_columns)
+@_inlined
+def _search(pairs: _Pairs, room: _Room, source: int, n_members: int, stay_out: float) -> int:
+    """Find the shortest alternating path, in reduced costs, from a member to a free column; return that column."""
+    n_b = pairs.last - pairs.first
+    for j in range(n_b + n_members):
+        room.distance[j], room.is_settled[j] = np.inf, False
+    row, column, base = source, NONE, 0.0
+    while True:
+        nearest, found = np.inf, NONE
+        for j in range(n_b + n_members):
+            if not room.is_settled[j]:
+                cost = _gated(pairs, room.member[row], j) if j < n_b else (stay_out if j - n_b == row else np.inf)
+                through = base + cost - room.row_price[row] - room.column_price[j]
+                if through < room.distance[j]:
+                    room.distance[j], room.reached_from[j] = through, column
+                if room.distance[j] < nearest:
+                    nearest, found = room.distance[j], j
+        column, base = found, nearest
+        room.is_settled[column] = True
+        if room.row_of_column[column] == NONE:
+            return column
+        row = room.row_of_column[column]
+
+
+@_inlined
+def _reprice(room: _Room, source: int, end: int, n_columns: int) -> None:
+    """Keep reduced costs at zero on what is paired, and not below it elsewhere."""
+    length = room.distance[end]
+    room.row_price[source] += length
+    for j in range(n_columns):
+        if room.is_settled[j] and j != end:
+            room.row_price[room.row_of_column[j]] += length - room.distance[j]
+            room.column_price[j] -= length - room.distance[j]
 
 
 @njit(cache=True, nogil=True)
@@ -160,16 +225,16 @@ def associate(  # noqa: PLR0917 - numba takes no keyword-only arguments
     reference, n_seen = np.zeros((len(xy_m), 2)), np.zeros(len(xy_m), dtype=np.int64)
     last_frame = np.empty(len(xy_m), dtype=np.int64)
     live, n_live, n_tracks = np.empty(len(xy_m), dtype=np.int64), 0, 0
-    partner, holder = np.empty(len(xy_m), dtype=np.int64), np.empty(len(xy_m), dtype=np.int64)
+    room = _room(len(xy_m), len(xy_m))
     for frame in range(len(frame_start) - 1):
         first, last = frame_start[frame], frame_start[frame + 1]
         n_live = _without_stale(live, n_live, last_frame, frame - 1 - max_missed_frames)
-        _match(reference, live, n_live, xy_m, first, last, gate_m, partner, holder)
+        _match(_Pairs(reference, live, n_live, xy_m, first, last, gate_m), room)
         for i in range(first, last):
             track[i] = NONE
         for k in range(n_live):
-            if partner[k] != NONE:
-                track[first + partner[k]] = live[k]
+            if room.partner[k] != NONE:
+                track[first + room.partner[k]] = live[k]
         for i in range(first, last):
             if track[i] == NONE:
                 track[i] = live[n_live] = n_tracks
