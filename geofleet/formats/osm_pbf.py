@@ -11,7 +11,6 @@ Read are dense nodes and ways, which is what every usual writer makes. Anything 
 from __future__ import annotations
 
 import zlib
-from bisect import bisect_right
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from geofleet.formats.osm_blobs import UnusualPbfError, check_features, read_blo
 from geofleet.formats.protobuf import BYTES, VARINT, DamagedPbfError, deltas, fields, signed, varint, varints
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from concurrent.futures import Future
     from pathlib import Path
 
@@ -39,6 +38,8 @@ __all__ = ["Block", "DenseNodes", "Strings", "UnusualPbfError", "read_blocks"]
 
 _THREADS, _AHEAD = 2, 4
 _NANO_PER_E7 = 100
+_NEWLINE = 0x0A  # field 1, bytes
+_HEAD = 3  # bytes by which strings are looked up
 _WAY_FIELDS = ((1, 0), (2, b""), (3, b""), (8, b""))  # id, keys, values, refs
 
 _T = TypeVar("_T")
@@ -59,54 +60,67 @@ class DenseNodes:
 
 @dataclass(frozen=True, slots=True)
 class Strings:
-    """A string table: where each string's field begins, and the end of the last one; strings are cut when asked for."""
+    """A string table: where each string begins and ends; strings are cut when asked for."""
 
     data: bytes
-    start: list[int]
+    begin: Ints
+    end: Ints
 
     @classmethod
     def of(cls, data: bytes, span: Span) -> Strings:
         """Find the strings of a table.
 
-        Each begins with a newline, as the format happens to have it, and says how long it is; so of all newlines those
-        are beginnings that follow from the first, which doubling steps find: 1, 2, 4, ... strings further.
+        Each begins with a newline, as the format happens to have it, and says how long it is. So all newlines are
+        taken for beginnings, and where one is not, since it stands inside of a string, those up to the string's end go.
         """
-        raw = np.frombuffer(data, np.uint8, span[1] - span[0] + 3, span[0]) if len(data) >= span[1] + 3 else None
-        if raw is None:
-            raw = np.frombuffer(data[slice(*span)] + b"\0\0\0", np.uint8)
-        size = len(raw) - 3
-        at = np.append(np.flatnonzero(raw[:size] == 0x0A), size)  # noqa: PLR2004 - field 1, bytes
-        first, second = raw[at + 1].astype(np.int64), raw[np.minimum(at + 2, size + 2)].astype(np.int64)
+        begin, end = span
+        if begin == end:
+            return cls(data, np.zeros(0, np.int64), np.zeros(0, np.int64))
+        raw = np.frombuffer(data, np.uint8)
+        at = np.append(np.flatnonzero(raw[begin:end] == _NEWLINE) + begin, end)
+        first, second = (raw[np.minimum(at + n, len(raw) - 1)].astype(np.int64) for n in (1, 2))
         is_long = first >= 0x80  # noqa: PLR2004 - the top bit says that more bytes follow
         ends = at + 2 + np.where(is_long, 1 + (first & 0x7F) + (second << 7), first)
-        step = np.searchsorted(at, np.minimum(ends, size))
-        step[-1] = len(at) - 1
-        is_wrong = (at[step] != ends) | (is_long & (second >= 0x80))  # noqa: PLR2004 - as above
-        is_wrong[-1] = False
-        found = np.zeros(1, np.int64)
-        while found[-1] != len(at) - 1:
-            found = np.concatenate((found, step[found]))
-            step = step[step]
-        start = found[: np.searchsorted(found, len(at) - 1) + 1]
-        if is_wrong[start].any() or (size and at[0]):
+        ends[is_long & (second >= 0x80)] = -1  # noqa: PLR2004 - as above
+        kept = np.ones(len(at), bool)
+        odd = np.flatnonzero(ends[:-1] != at[1:])
+        after = np.searchsorted(at, np.minimum(ends[odd], end))
+        is_wrong = at[after] != ends[odd]
+        beyond = 0
+        for place, follows, wrong in zip(odd.tolist(), after.tolist(), is_wrong.tolist(), strict=True):
+            if place >= beyond:
+                if wrong:
+                    raise DamagedPbfError("a string table with something else in it")
+                kept[place + 1 : follows] = False
+                beyond = follows
+        if at[0] != begin:
             raise DamagedPbfError("a string table with something else in it")
-        return cls(data, (at[start] + span[0]).tolist())
+        kept[-1] = False
+        return cls(data, (at + 2 + is_long)[kept], ends[kept])
 
     def __len__(self) -> int:
-        return len(self.start) - 1
+        return len(self.begin)
 
     def __getitem__(self, index: int) -> bytes:
-        at, end = self.start[index], self.start[index + 1]
-        return self.data[at + 2 : end] if self.data[at + 1] < 0x80 else self.data[varint(self.data, at + 1)[1] : end]  # noqa: PLR2004 - as above
+        return self.data[self.begin[index] : self.end[index]]
 
-    def numbers(self, field: bytes, *, whole: bool) -> Iterator[int]:
-        """Yield the numbers of the strings whose field has these bytes somewhere after its head, or is these bytes."""
-        at = self.data.find(field, self.start[0], self.start[-1])
-        while at >= 0:
-            index = bisect_right(self.start, at) - 1
-            if not whole or self.start[index] == at:
-                yield index
-            at = self.data.find(field, self.start[index + 1], self.start[-1])
+    def take(self, numbers: Ints) -> list[bytes]:
+        """Return the strings of some numbers."""
+        places = zip(self.begin[numbers].tolist(), self.end[numbers].tolist(), strict=True)
+        return [self.data[at:end] for at, end in places]
+
+    def numbers(self, texts: Iterable[bytes]) -> list[int]:
+        """Return the numbers of the strings that are one of some texts, of three bytes or more."""
+        wanted = set(texts)
+        return [n for n in self.starting(wanted) if self[n] in wanted]
+
+    def starting(self, heads: Iterable[bytes]) -> list[int]:
+        """Return the numbers of the strings whose first three bytes are those of one of some texts."""
+        raw = np.frombuffer(self.data, np.uint8)
+        at = np.minimum(self.begin, len(raw) - _HEAD)
+        first, second, third = (raw[at + n].astype(np.uint32) for n in range(_HEAD))
+        wanted = {int.from_bytes(head[:_HEAD], "big") for head in heads}
+        return np.flatnonzero(np.isin(first << 16 | second << 8 | third, list(wanted))).tolist()
 
 
 @dataclass(frozen=True)
@@ -199,7 +213,7 @@ class Block:
         node_id, lat, lon = (deltas(packed[number]) for number in (1, 8, 9))
         if not len(node_id) == len(lat) == len(lon):
             raise DamagedPbfError("ids and positions differ in number")
-        lat_e7, lon_e7 = (_e7(numbers[offset] + numbers[17] * side) for offset, side in ((19, lat), (20, lon)))
+        lat_e7, lon_e7 = (_e7(numbers[offset], numbers[17], side) for offset, side in ((19, lat), (20, lon)))
         return DenseNodes(node_id, lon_e7, lat_e7, varints(packed[10]) if tagged else np.zeros(0, np.int64))
 
 
@@ -242,6 +256,9 @@ def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = F
                 done.cancel()
 
 
-def _e7(nano: Ints) -> Ints:
-    """Return 1e-9 degrees in 1e-7, rounded towards zero as libosmium does, so that every tool reads the same place."""
+def _e7(offset: int, granularity: int, coded: Ints) -> Ints:
+    """Return degrees as a block has them in 1e-7, rounded towards zero as libosmium does: every tool reads the same."""
+    if offset % _NANO_PER_E7 == 0 and granularity % _NANO_PER_E7 == 0:
+        return offset // _NANO_PER_E7 + granularity // _NANO_PER_E7 * coded
+    nano = offset + granularity * coded
     return np.where(nano < 0, -(-nano // _NANO_PER_E7), nano // _NANO_PER_E7)

@@ -26,6 +26,7 @@ _E7 = 1e7
 _MAX_E7 = (1_800_000_000, 900_000_000)
 _NOWHERE = np.iinfo(np.int32).max
 _HIGHWAY = b"\n\x07highway"
+_CAR_ROADS, _ROAD_KEYS = ([word.encode() for word in words] for words in (CAR_ROADS, ROAD_KEYS))
 
 
 def read_roads(pbf: Path) -> Roads:
@@ -98,7 +99,7 @@ def _ways_in(block: Block) -> _Ways | None:
     if not block.holds_string(_HIGHWAY):
         return None
     strings = block.strings
-    highway = next(strings.numbers(_HIGHWAY, whole=True), None)
+    highway = next(iter(strings.numbers([b"highway"])), None)
     if highway is None:
         return None
     mark = _encoded(highway)
@@ -124,19 +125,14 @@ def _ways_in(block: Block) -> _Ways | None:
 def _roads_at(strings: Strings, highway: int, keys: Ints, values: Ints) -> Ints:
     """Return the places of tags that make a way a road for cars."""
     is_road = np.zeros(len(strings), bool)
-    for word in CAR_ROADS:
-        is_road[list(strings.numbers(b"\n%c" % len(word) + word.encode(), whole=True))] = True
+    is_road[strings.numbers(_CAR_ROADS)] = True
     at = np.flatnonzero(keys == highway)
     return at[is_road[values[at]]]
 
 
 def _tags(strings: Strings, keys: Ints, values: Ints, start: Ints, ways: Ints) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield some of the ways with those of their tags that matter to a car."""
-    names = {
-        number: word
-        for word in ROAD_KEYS
-        for number in strings.numbers(b"\n%c" % len(word) + word.encode(), whole=True)
-    }
+    names = {number: strings[number].decode() for number in strings.numbers(_ROAD_KEYS)}
     for way, first, last in zip(ways.tolist(), start[ways].tolist(), start[ways + 1].tolist(), strict=True):
         pairs = zip(keys[first:last].tolist(), values[first:last].tolist(), strict=True)
         yield way, {names[key]: strings[value].decode(errors="replace") for key, value in pairs if key in names}

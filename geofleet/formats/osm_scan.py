@@ -41,7 +41,7 @@ _MARK_WITHIN = 1024
 _LANELET = re.compile(rb"""v=["']lanelet["']""")
 _CHUNK, _OVERLAP = 1 << 20, 64
 _TAG_BYTES = 16  # two numbers
-_HIGHWAY = b"\n\x07highway"
+_STARTS = [word.encode() for word in (*KEY_STARTS, *POINT_HIGHWAYS)]
 # What a block with signs has in its string table: a key, or a word of `highway` with its length before it.
 _WORDS = tuple(b"\n%c" % len(word) + word.encode() for word in POINT_HIGHWAYS)
 _MARKS = (b"traffic_sign", *_WORDS)
@@ -65,14 +65,15 @@ class SignNodes:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """Sign nodes of a group: id, position, tags of each as numbers of strings, (m, 2), and the strings used."""
+    """Sign nodes of a group: id, position, tags as numbers of strings, (m, 2), and which strings those are."""
 
     node_id: Ints
     lon_e7: Ints
     lat_e7: Ints
     n_tags: Ints
     tags: Ints
-    used: list[tuple[int, bytes]]
+    used: Ints
+    texts: list[bytes]
 
 
 def detect(head: bytes) -> str:
@@ -190,9 +191,8 @@ def sign_nodes(pbf: Path) -> SignNodes:
 
 def _numbered(found: _Found, known: dict[bytes, int], tagsets: dict[bytes, int]) -> NDArray[np.int32]:
     """Return the number of each node's set of tags, in what was met so far; every block numbers its strings anew."""
-    number = np.zeros(found.used[-1][0] + 1 if found.used else 0, np.int64)
-    for own, text in found.used:
-        number[own] = known.setdefault(text, len(known))
+    number = np.zeros(found.used[-1] + 1 if len(found.used) else 0, np.int64)
+    number[found.used] = [known.setdefault(text, len(known)) for text in found.texts]
     packed = number[found.tags].tobytes()
     ends = (_TAG_BYTES * np.cumsum(found.n_tags)).tolist()
     return np.array(
@@ -224,9 +224,9 @@ def _signs_in(block: Block) -> list[_Found] | None:
     for nodes in block.dense_nodes():
         if len(nodes.keys_vals):
             chosen, counts, tags = _sign_tags(nodes, key_role, is_word, highway)
-            used = np.flatnonzero(np.bincount(tags.ravel())).tolist()
+            used = np.flatnonzero(np.bincount(tags.ravel()))
             place = (nodes.node_id[chosen], nodes.lon_e7[chosen], nodes.lat_e7[chosen])
-            groups.append(_Found(*place, counts, tags, [(number, strings[number]) for number in used]))
+            groups.append(_Found(*place, counts, tags, used, strings.take(used)))
     return groups
 
 
@@ -234,13 +234,15 @@ def _roles(strings: Strings) -> tuple[NDArray[np.int8], NDArray[np.bool_], int]:
     """Tell which strings are keys that tell of signs (1) or name them (2), which are signs' words, which is highway."""
     role = np.zeros(len(strings), np.int8)
     is_word = np.zeros(len(strings), bool)
-    for start in KEY_STARTS:
-        for index in strings.numbers(start.encode(), whole=False):
-            key = strings[index].decode(errors="replace")
-            role[index] = 2 if is_sign_key(key) else tells_of_signs(key)
-    for word in _WORDS:
-        is_word[list(strings.numbers(word, whole=True))] = True
-    return role, is_word, next(strings.numbers(_HIGHWAY, whole=True), -1)
+    highway = -1
+    for index in strings.starting(_STARTS):
+        text = strings[index].decode(errors="replace")
+        if index and text.startswith(KEY_STARTS):
+            role[index] = 2 if is_sign_key(text) else tells_of_signs(text)
+        is_word[index] = text in POINT_HIGHWAYS
+        if text == "highway" and highway < 0:
+            highway = index
+    return role, is_word, highway
 
 
 def _sign_tags(
@@ -248,15 +250,15 @@ def _sign_tags(
 ) -> tuple[Ints, Ints, Ints]:
     """Return which nodes carry signs, how many tags of theirs tell of them, and those: numbers of strings, (m, 2)."""
     coded = nodes.keys_vals
-    is_end = coded == 0
-    node_of = np.cumsum(is_end) - is_end
-    ends = np.flatnonzero(is_end)
+    ends = np.flatnonzero(coded == 0)
     if len(ends) != len(nodes.node_id) or ends[-1] != len(coded) - 1:
         raise ValueError("tags and nodes differ in number")
-    start = np.concatenate(([0], ends[:-1] + 1))
-    is_key = ~is_end & ((np.arange(len(coded)) - start[node_of]) % 2 == 0)
-    at = np.flatnonzero(is_key & (key_role[coded] > 0))
-    key, value, owner = coded[at], coded[at + 1], node_of[at]
+    at = np.flatnonzero((key_role > 0)[coded])
+    owner = np.searchsorted(ends, at)
+    start = np.where(owner > 0, ends[owner - 1] + 1, 0)
+    is_key = (at - start) % 2 == 0
+    at, owner = at[is_key], owner[is_key]
+    key, value = coded[at], coded[at + 1]
     names = (key_role[key] == 2) | ((key == highway) & is_word[value])  # noqa: PLR2004 - the role of sign keys
     carries = np.zeros(len(nodes.node_id), bool)
     carries[owner[names]] = True

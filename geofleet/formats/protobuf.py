@@ -5,7 +5,7 @@ As in https://protobuf.dev/programming-guides/encoding/.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
 
 VARINT, BYTES = 0, 2
-_MAX_VARINT_BYTES = 10
+_MAX_VARINT_BYTES, _SHORT_BYTES = 10, 4
 _FIXED_BYTES = {1: 8, 5: 4}
 
 Span = tuple[int, int]
@@ -42,14 +42,30 @@ def varints(packed: bytes) -> Ints:
     most = int(n_more.max())
     if most >= _MAX_VARINT_BYTES:
         raise DamagedPbfError("a number of more than ten bytes")
-    kind: Any = np.uint32 if most < 4 else np.uint64  # noqa: PLR2004 - 28 bits in four bytes
-    low = raw & 0x7F
-    value: NDArray[Any] = low[starts].astype(kind)
-    n_more = n_more.astype(np.uint8)
-    for place in range(1, most + 1):
-        rows = np.flatnonzero(n_more >= place)
-        value[rows] |= low[starts[rows] + place].astype(kind) << kind(7 * place)
-    return value.astype(np.uint64).view(np.int64)
+    value = _short(raw, starts, most)
+    if most >= _SHORT_BYTES:
+        rows = np.flatnonzero(n_more >= _SHORT_BYTES)
+        value[rows] = _long(raw, starts[rows], n_more[rows])
+    return value
+
+
+def _short(raw: NDArray[np.uint8], starts: Ints, most: int) -> Ints:
+    """Return the numbers of up to four bytes: seven bits of each are laid together where they are, by twos."""
+    bits = (raw & 0x7F).astype(np.uint32)
+    goes_on = (raw >> 7).astype(np.uint32)
+    bits[:-1] |= (bits[1:] << np.uint32(7)) * goes_on[:-1]
+    if most > 1:
+        bits[:-2] |= (bits[2:] << np.uint32(14)) * (goes_on[:-2] & goes_on[1:-1])
+    return bits[starts].astype(np.int64)
+
+
+def _long(raw: NDArray[np.uint8], starts: Ints, n_more: Ints) -> Ints:
+    """Return numbers of any length, each from a row of its bytes."""
+    place = np.arange(int(n_more.max()) + 1)
+    bits = raw[np.minimum(starts[:, None] + place, len(raw) - 1)].astype(np.uint64) & np.uint64(0x7F)
+    bits[place > n_more[:, None]] = 0
+    joined: Ints = np.bitwise_or.reduce(bits << (7 * place).astype(np.uint64), axis=1).view(np.int64)
+    return joined
 
 
 def varints_of(parts: list[bytes]) -> tuple[Ints, Ints]:
@@ -65,9 +81,9 @@ def varints_of(parts: list[bytes]) -> tuple[Ints, Ints]:
 
 def deltas(packed: bytes) -> Ints:
     """Decode packed, zigzag-coded differences to the numbers themselves."""
-    coded = varints(packed).view(np.uint64)
-    half = (coded >> np.uint64(1)).view(np.int64)
-    return np.cumsum(np.where(coded & np.uint64(1), ~half, half))
+    coded = varints(packed)
+    half = (coded.view(np.uint64) >> np.uint64(1)).view(np.int64)
+    return np.cumsum(half ^ -(coded & 1))
 
 
 def fields(data: bytes, span: Span) -> Iterator[tuple[int, int | Span]]:

@@ -105,9 +105,8 @@ def test_strings_are_found_wherever_their_bytes_repeat(texts):
     strings = Strings.of(table, (0, len(table)))
     assert [strings[n] for n in range(len(strings))] == texts
     for text in texts:
-        assert [n for n, other in enumerate(texts) if other == text] == list(
-            strings.numbers(field(1, text), whole=True)
-        )
+        if len(text) >= 3:
+            assert [n for n, other in enumerate(texts) if other == text] == strings.numbers([text])
 
 
 def all_of(nodes):
