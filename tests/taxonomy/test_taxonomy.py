@@ -89,7 +89,7 @@ def test_no_pattern_is_shadowed_by_an_equal_one(rows):
         ("347[16 t]", "FI", "bogie_load_limit:16"),
         ("115[10 %]", "FI", "steep_descent:10"),
         ("413[right]", "FI", "turn_right_ahead"),
-        ("855a[9-21 (9-18)]", "FI", "plate_time"),
+        ("855a[9-21 (9-18)]", "FI", "plate_payment"),
         ("632[FI:672[up] FI:667[3]]", "FI", "direction_sign"),
         ("AB4", "FR", "stop"),
         ("B14_(30)", "FR", "speed_limit:30"),
