@@ -153,17 +153,18 @@ def score_prior(run: Run, prior: PriorMap) -> MapScore:
 def dbscan(
     folder: Path, case: Case, n_vehicles: int, *, corrected: bool
 ) -> dict[str, tuple[Floats, Floats, list[str]]]:
-    """Return DBSCAN's maps of a batch of replicates by run: longitude, latitude and class."""
-    out = folder / "dbscan.parquet"
-    config = load_config(case.scenario, {"method": "dbscan", "correct_bias": corrected})
-    aggregate(
-        folder / "detections",
-        out,
-        config=config,
-        n_vehicles=n_vehicles,
-        passes=folder / "passes.parquet",
-        n_workers=1,
-    )
+    """Return DBSCAN's maps of a batch of replicates by run: longitude, latitude, class; made once, like the fleets."""
+    out = folder / f"dbscan-{n_vehicles}{'-corrected' if corrected else ''}.parquet"
+    if not out.exists():
+        config = load_config(case.scenario, {"method": "dbscan", "correct_bias": corrected})
+        aggregate(
+            folder / "detections",
+            out,
+            config=config,
+            n_vehicles=n_vehicles,
+            passes=folder / "passes.parquet",
+            n_workers=1,
+        )
     layer = read_table(SIGNS, out)
     maps = {}
     for run_id in set(layer["run_id"].to_pylist()):

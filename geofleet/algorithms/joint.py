@@ -173,9 +173,15 @@ def _described(
         chances, n_in_view = _chances(solution, views, n_fleet, sign_of_track, view_xy)
     in_prior = np.bincount(sign[~is_fleet], minlength=n_signs) > 0 if search.has_prior else None
     class_code = np.argmax(log_posterior, axis=1) if n_signs else np.zeros(0, np.int64)
-    beside = _beside(solution.xy_m, class_code, n_passes)
     support = evidence.Support(
-        n_passes.astype(np.float64), n_in_view, chances, beside, in_prior, n_fleet, n_classes=search.n_classes
+        n_passes.astype(np.float64),
+        n_in_view,
+        chances,
+        _beside(solution.xy_m, class_code, n_passes),
+        in_prior,
+        _moved_to(solution.xy_m, class_code, n_passes, in_prior),
+        n_fleet,
+        search.n_classes,
     )
     found = evidence.existence(support)
     return JointMap(
@@ -208,6 +214,26 @@ def _beside(xy_m: Floats, class_code: Ints, n_passes: Ints) -> Floats:
         counts = (class_code[one] == class_code[two]) & (n_passes[two] > FAR_MORE * n_passes[one])
         np.maximum.at(beside, one[counts], n_passes[two[counts]])
     return beside
+
+
+def _moved_to(xy_m: Floats, class_code: Ints, n_passes: Ints, in_prior: Flags | None) -> Ints:
+    """Return for each entry of the prior map that nobody reports the nearest sign of its class that it does not hold.
+
+    A sign is what the nearest entry moved to only; -1 where there is none.
+    """
+    moved_to = np.full(len(xy_m), -1)
+    if in_prior is None or in_prior.all() or not in_prior.any():
+        return moved_to
+    entry, new = np.flatnonzero(in_prior & (n_passes == 0)), np.flatnonzero(~in_prior)
+    pairs = cKDTree(xy_m[entry]).sparse_distance_matrix(cKDTree(xy_m[new]), evidence.MOVED_M, output_type="ndarray")
+    of, to, away_m = entry[pairs["i"]], new[pairs["j"]], pairs["v"]
+    alike = class_code[of] == class_code[to]
+    order = np.lexsort((of, to, away_m))
+    free = np.ones(len(xy_m), np.bool_)
+    for row in order[alike[order]]:  # few: entries that nobody reports, beside new signs of their class
+        if free[of[row]] and free[to[row]]:
+            moved_to[of[row]], free[of[row]], free[to[row]] = to[row], False, False
+    return moved_to
 
 
 def _chances(solution: Solution, views: Views, n_fleet: int, sign: Ints, view_xy: Floats) -> tuple[Floats, Floats]:

@@ -38,7 +38,7 @@ FREE_ROUNDS, JITTER_INERTIA = 4, 1.0
 
 PRIOR_SHIFT_M = (0.1, 1.0)
 """Standard deviation an axis of the translation of a prior map as a whole: as a rule, and when it is off."""
-PRIOR_IS_OFF = 0.5
+PRIOR_IS_OFF = 1 / 3
 """Probability beforehand that it is off."""
 LEFT_OUT = 0.1
 """What a 90 % ellipse leaves out: up to so much the other translation need not lie in it."""

@@ -201,9 +201,57 @@ def test_tracks_of_a_pass_are_two_signs_when_they_share_a_frame_and_one_when_the
 def test_a_sign_of_nearly_all_passes_is_kept_and_a_ghost_of_some_is_not() -> None:
     n = np.array([95.0, 40.0, 1.0])
     view = np.full(3, 100.0)
-    found = existence(Support(n, view, view, np.zeros(3), None, 100, n_classes=4))
+    found = existence(Support(n, view, view, np.zeros(3), None, np.full(3, -1), 100, n_classes=4))
     assert found.probability[0] > 0.95
     assert (found.probability[1:] < 0.1).all()
+
+
+def prior_support(n_passes: list[int], chances: float, in_view: int, moved_to: list[int] | None = None) -> Support:
+    """Return evidence for signs of a fleet of `in_view` passes, the last of which the prior map does not hold."""
+    n = np.array(n_passes, np.float64)
+    every = np.ones(len(n))
+    return Support(
+        n,
+        in_view * every,
+        chances * every,
+        0 * every,
+        np.arange(len(n)) < len(n) - 1,
+        np.array(moved_to) if moved_to else np.full(len(n), -1),
+        in_view,
+        n_classes=15,
+    )
+
+
+def test_an_entry_that_passes_drove_by_in_full_view_goes_and_one_in_brief_view_stays() -> None:
+    many = [2] * 20
+    assert existence(prior_support([0, *many], 2.0, 2)).probability[0] < 0.5
+    assert existence(prior_support([0, *many], 0.5, 2)).probability[0] > 0.5
+
+
+def test_missed_by_all_in_brief_view_is_no_proof_but_by_many_it_counts() -> None:
+    """A brief view is alike for all passes: fifty misses are no fifty independent ones."""
+    gone = [existence(prior_support([0, 50, 50], 0.3 * n, n)).probability[0] for n in (3, 50)]
+    assert gone[0] > 0.5 > gone[1]
+    assert gone[1] > 0.001
+
+
+def test_an_entry_beside_a_new_sign_of_its_class_moved_there() -> None:
+    """Unseen, it would stay; the new sign is likelier the same, moved, than a second of its class within ten metres."""
+    reported = [1] * 20
+    alone = existence(prior_support([0, *reported], 0.5, 1)).probability
+    moved = existence(prior_support([0, *reported], 0.5, 1, [20, *[-1] * 20])).probability
+    assert moved[0] < 0.5 < alone[0]
+    np.testing.assert_allclose(moved[1:], alone[1:], atol=0.05)
+
+
+def test_how_many_entries_stand_is_learnt_from_those_in_full_view() -> None:
+    """Where most entries have gone, one that nobody could judge is likelier gone too."""
+    n = np.array([1.0] * 30 + [0.0] * 31)
+    view = np.append(np.ones(60), 0.0)
+    fresh = existence(Support(np.append(np.ones(60), 0.0), view, view, 0 * n, n >= 0, np.full(61, -1), 1, 15))
+    stale = existence(Support(n, view, view, 0 * n, n >= 0, np.full(61, -1), 1, 15))
+    assert fresh.probability[-1] > 0.95
+    assert 0.4 < stale.probability[-1] < 0.7
 
 
 def test_classes_are_a_vote_of_log_confusions() -> None:
@@ -258,6 +306,18 @@ def test_a_stale_prior_map_is_put_right() -> None:
     np.testing.assert_allclose(_sorted(found.xy_m[reported]), signs, atol=0.3)
     order = np.argsort(found.xy_m[reported, 0])
     np.testing.assert_array_equal(found.class_code[reported][order], classes)
+
+
+def test_an_entry_whose_sign_moved_is_not_a_second_sign_though_nobody_is_known_to_have_driven_by() -> None:
+    signs, classes, tracks = fleet(3, noise_m=0.05)
+    old = signs.copy()
+    old[5] += [5.0, 0.0]
+    old[9] += [20.0, 0.0]  # too far to have moved: a sign that is gone, or not yet seen
+    some = slice(4, 12)
+    found = fuse_joint(tracks, plain_passes(3), n_classes=4, prior=prior_of(old[some], classes[some]))
+    there = found.xy_m[found.existence > 0.5]
+    near = [(np.hypot(*(there - place).T) < 1).sum() for place in (signs[5], old[5], signs[9], old[9])]
+    assert near == [1, 0, 1, 1]
 
 
 def test_the_covariance_covers_a_prior_map_that_is_shifted() -> None:
