@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from geofleet.algorithms.dealing import deal, index_readers, take_rows, unpack_rows
+from geofleet.tables.overlap import work_behind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -57,14 +57,7 @@ class Dealer:
 
     def deal_all(self, blocks: Iterable[Columns]) -> None:
         """Deal all blocks; the next one is made while one is dealt."""
-        with ThreadPoolExecutor(1) as pool:
-            dealing = None
-            for block in blocks:
-                if dealing:
-                    dealing.result()
-                dealing = pool.submit(self._deal, block)
-            if dealing:
-                dealing.result()
+        work_behind(self._deal, blocks)
 
     def _deal(self, column: Columns) -> None:
         run = self._run_of_pass[column["pass_code"]]

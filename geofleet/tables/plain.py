@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from geofleet.algorithms.surveying import CellCounts, are_placed, mark_ids, mean_variances, number_combinations
 from geofleet.tables.arrays import arrow_numbers, arrow_texts, numpy_numbers
 from geofleet.tables.dealt import NEVER_BEGUN, NEVER_ENDED
+from geofleet.tables.overlap import work_behind
 from geofleet.tables.schemas import BBOX, DETECTIONS, TEXT
 
 if TYPE_CHECKING:
@@ -82,8 +83,7 @@ def survey(path: Path, fine_zoom: int) -> Survey | None:
         return None
     surveyor = _Surveyor(*ids, fine_zoom)
     try:
-        for block in _blocks(path, ("track_id", *_PLACE)):
-            surveyor.add(block)
+        work_behind(surveyor.add, _blocks(path, ("track_id", *_PLACE)))
     except _NotPlainError:
         return None
     return surveyor.found(path)

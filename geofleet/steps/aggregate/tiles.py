@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
 
 from geofleet.algorithms.tiling import halo_m
 from geofleet.engines.batches import TileTask, cluster_batch, concatenate, fuse_open, splitter
-from geofleet.engines.local import run_tasks
+from geofleet.engines.local import release_memory, run_tasks
 from geofleet.tables.arrays import numpy_numbers
 from geofleet.tables.database import connect
 from geofleet.tables.dealt import batch_path
@@ -59,7 +58,7 @@ def stage(
         )
     finally:
         connection.close()
-        pa.default_memory_pool().release_unused()
+        release_memory()
 
 
 def cluster_tiles_of(
@@ -69,7 +68,9 @@ def cluster_tiles_of(
     tasks = _tile_tasks(staged, settings)
     results = list(run_tasks(cluster_batch, tasks, n_workers=n_workers, progress=progress))
     crossing = fuse_open([r.open_rows for r in results], splitter(tasks[0]) if tasks else None)
-    return concatenate([*(r.clusters for r in results), crossing])
+    clusters = concatenate([*(r.clusters for r in results), crossing])
+    release_memory()
+    return clusters
 
 
 def _tile_tasks(staged: Staged, settings: AggregateConfig) -> list[TileTask]:
