@@ -1,6 +1,7 @@
 """Does F1 hold as passes grow to 2,000? The demo scene, DBSCAN's core rule fixed and following the passes.
 
     python benchmarks/fleet_growth.py --seed 11 --replicates 10
+    python benchmarks/fleet_growth.py --seed 11 --replicates 10 --set min_samples_free_passes=20 --shares 0.5
 
 Means over replicates. `step` is the mean change of F1 from the size before, replicate by replicate, with its standard
 error: a fleet of 50 is the first 50 vehicles of the fleet of 100, so that the sizes share their luck.
@@ -38,6 +39,9 @@ def main() -> None:
     parser.add_argument("--replicates", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=Path, default=RAW / "helsinki_derived.pos")
+    parser.add_argument(
+        "--with-passes", action="store_true", help="support relative to the passes that had a place in view"
+    )
     args = parser.parse_args()
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -52,12 +56,13 @@ def main() -> None:
             n_replicates=args.replicates,
             seed=args.seed,
         )
+        passes = out / "passes" if args.with_passes else None
         print("vehicles  share     F1   step (s.e.)        tp    fp    fn  GOSPA_M")
         before: dict[float, NDArray[np.float64]] = {}
         for size in args.sizes:
             for share in args.shares:
                 config = load_config(args.scenario, [*args.set, f"min_samples_share={share}"])
-                aggregate(out / "detections", folder / "fused.parquet", config=config, n_vehicles=size)
+                aggregate(out / "detections", folder / "fused.parquet", config=config, n_vehicles=size, passes=passes)
                 totals = evaluate(
                     folder / "fused.parquet", out / "reference.parquet", folder / "evaluation", config=config
                 ).totals

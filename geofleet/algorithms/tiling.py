@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 MAX_ZOOM = 23  # ST_QuadKey's
 MAX_LAT_DEG = math.degrees(math.atan(math.sinh(math.pi)))  # 85.0511: where Web Mercator is a square
 HALO_PER_EPS = 2.0
-FREE_PASSES = 50  # of a cluster: its core rule does not follow these
 _HALF_TURN_DEG = 180.0
 _HALO_SLACK = 1.001  # the halo is measured by degrees, to 0.1 %
 
@@ -200,15 +199,23 @@ def join_open(point: Ints, cluster: Ints, is_core: Flags, is_owned: Flags) -> tu
 
 
 def split_chains(
-    lon_deg: Floats, lat_deg: Floats, cluster: Ints, pass_code: Ints, *, eps_m: float, min_samples: int, share: float
+    lon_deg: Floats,
+    lat_deg: Floats,
+    cluster: Ints,
+    pass_code: Ints,
+    *,
+    eps_m: float,
+    min_samples: int,
+    share: float,
+    free_passes: int,
 ) -> Ints:
     """Cluster the members of each cluster anew with a core rule that follows the passes behind it.
 
     The more passes, the more far-out detections: with a fixed core rule three of them bridge two signs of a class, and
     clusters grow into chains as fleets do. A sign has a place that most of its passes agree on within eps; what lies
     between two signs has not. So a cluster of P passes is clustered again, by itself, with
-    max(min_samples, share (P - 50)) for a core; what is left over is noise. The first fifty passes are free: a count of
-    so few says little, and the rule sets in without a step. A cluster is known whole by then, so that tiles do not
+    max(min_samples, share (P - free_passes)) for a core; what is left over is noise. Some passes are free: a count of a
+    few says little, and the rule sets in without a step. A cluster is known whole by then, so that tiles do not
     show in this either.
 
     Parameters
@@ -219,8 +226,8 @@ def split_chains(
         (n,) their clusters.
     eps_m, min_samples
         Those of the clusters.
-    share
-        Share of the passes of a cluster beyond `FREE_PASSES` that make a core, 0 … 1.
+    share, free_passes
+        Share of the passes of a cluster beyond `free_passes` that make a core, 0 … 1.
 
     Returns
     -------
@@ -230,7 +237,7 @@ def split_chains(
     group = np.cumsum(is_first) - 1
     is_pass = is_first | np.append(True, np.diff(pass_code) != 0)
     n_passes = np.bincount(group[is_pass])
-    least = np.maximum(min_samples, np.ceil(share * np.maximum(n_passes - FREE_PASSES, 0))).astype(np.int64)
+    least = np.maximum(min_samples, np.ceil(share * np.maximum(n_passes - free_passes, 0))).astype(np.int64)
     again = least[group] > min_samples
     if not again.any():
         return cluster

@@ -53,6 +53,7 @@ class TileTask:
     eps_m: float
     min_samples: int
     min_samples_share: float
+    min_samples_free_passes: int
     semantic: str
 
 
@@ -89,7 +90,13 @@ def cluster_batch(task: TileTask) -> TileResult:
 
 def splitter(task: TileTask) -> Splitter:
     """Return `split_chains` with the settings of a task."""
-    return partial(split_chains, eps_m=task.eps_m, min_samples=task.min_samples, share=task.min_samples_share)
+    return partial(
+        split_chains,
+        eps_m=task.eps_m,
+        min_samples=task.min_samples,
+        share=task.min_samples_share,
+        free_passes=task.min_samples_free_passes,
+    )
 
 
 def fuse_open(parts: Sequence[Columns], split: Splitter | None = None) -> Columns:

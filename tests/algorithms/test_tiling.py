@@ -255,7 +255,7 @@ def test_a_core_rule_that_follows_the_passes_splits_what_a_fixed_one_chains():
     xy, lon, lat, pass_code = chain(np.random.default_rng(0), 600)
     assert dbscan(xy, 4.0, 3).max() == 0  # one chain
     one = np.zeros(len(lon), np.int64)
-    split = split_chains(lon, lat, one, pass_code, eps_m=4.0, min_samples=3, share=0.5)
+    split = split_chains(lon, lat, one, pass_code, eps_m=4.0, min_samples=3, share=0.5, free_passes=50)
     assert set(split.tolist()) - {-1} == {1, 2}
     for label in (1, 2):
         assert len(set((xy[split == label, 0] > 6.5).tolist())) == 1  # all of it on one side
@@ -267,5 +267,18 @@ def test_a_core_rule_that_follows_the_passes_splits_what_a_fixed_one_chains():
 def test_few_passes_leave_clusters_as_they_are():
     _, lon, lat, pass_code = chain(np.random.default_rng(0), 56)  # 3 is half of those beyond fifty
     clusters = np.full(2 * 56, 4)
-    assert split_chains(lon, lat, clusters, pass_code, eps_m=4.0, min_samples=3, share=0.5) is clusters
-    assert split_chains(lon, lat, clusters, pass_code, eps_m=4.0, min_samples=2, share=0.5) is not clusters
+    assert split_chains(lon, lat, clusters, pass_code, eps_m=4.0, min_samples=3, share=0.5, free_passes=50) is clusters
+    assert (
+        split_chains(lon, lat, clusters, pass_code, eps_m=4.0, min_samples=2, share=0.5, free_passes=50) is not clusters
+    )
+
+
+def test_the_fewer_passes_are_free_the_sooner_the_rule_sets_in():
+    xy, lon, lat, pass_code = chain(np.random.default_rng(0), 56)
+    split = split_chains(
+        *(lon, lat, np.zeros(len(lon), np.int64), pass_code), eps_m=4.0, min_samples=3, share=0.5, free_passes=20
+    )
+    expected = dbscan(xy, 4.0, 18)
+    assert expected.max() == 1
+    assert np.array_equal(split < 0, expected < 0)
+    assert len(np.unique(np.column_stack((split, expected)), axis=0)) == len(np.unique(split))
