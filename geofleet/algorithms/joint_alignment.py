@@ -8,10 +8,13 @@ the map of all others, until nothing moves.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
+
+from geofleet.algorithms.joint_grid import NOTHING, Grid, file_thing, grid_around, longer, things_around, unfile_thing
+from geofleet.algorithms.joint_offsets import SIGN_DENSITY_M2, Partners, best_offset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,21 +25,10 @@ if TYPE_CHECKING:
 CORE_M = 0.5
 """Passes laid on each other fit to this, an axis, beside what their tracks declare."""
 REACH_SIGMAS = 4.0
-SIGN_DENSITY_M2 = 1e-3
-"""Signs a square metre near a road: what a chance partner is weighed against."""
 OTHER_CLASS = 0.01
 """A partner of another class counts this much: a misread class still holds the pass in place."""
-PARTNER_CHI2 = 18.0
-"""A partner further away than this lends no weight."""
-FEW_OFFSETS = 256
-"""So many candidate offsets are all weighed; of more, those that most rows vote for."""
-VOTED_OFFSETS = 32
-VOTE_CELL_M = 0.5
-ENOUGH_ROWS = 200
-"""So many rows, evenly along the pass, tell offsets apart; all of them say where exactly the one chosen lies."""
 N_ROUNDS = 3
 MOVED_M = 0.25
-NO_POINT = -1
 
 
 def align_passes(
@@ -58,14 +50,11 @@ def align_passes(
     n_passes = len(first) - 1
     if n_passes == 0:
         return np.zeros((0, 2))
-    offset: Floats = _align(
-        np.ascontiguousarray(xy_m),
-        np.sqrt(var_m2 + CORE_M**2),
-        class_code,
-        first,
-        sigma_m,
-        _order(xy_m, first, sigma_m, cell_m),
-    )
+    order = _order(xy_m, first, sigma_m, cell_m)
+    passes = _Passes(np.ascontiguousarray(xy_m), np.sqrt(var_m2 + CORE_M**2), class_code, first, sigma_m**2)
+    var_m2_base = float(passes.sigma2[order[0]])
+    reach_m = REACH_SIGMAS * float(np.sqrt(passes.sigma2.max() + var_m2_base))
+    offset: Floats = _align(passes, order, var_m2_base, _no_points(len(xy_m)), grid_around(xy_m, reach_m, len(xy_m)))
     return offset
 
 
@@ -103,266 +92,187 @@ def _walk(key: Ints, first: Ints, owner: Ints, start: Ints, worth: Floats) -> In
     return order
 
 
+class _Passes(NamedTuple):
+    """Tracks, by pass."""
+
+    xy_m: Floats  # (n, 2)
+    spread_m: Floats  # (n,)
+    class_code: Ints  # (n,)
+    first: Ints  # (n_passes + 1,)
+    sigma2: Floats  # (n_passes,) variance an axis of the offset of each pass
+
+
+class _Points(NamedTuple):
+    """The map so far: means of tracks of one class. There are no more of them than tracks."""
+
+    total: Floats  # (n, 2) sum of the places of its tracks, offsets taken out
+    n_tracks: Ints  # (n,)
+    class_code: Ints  # (n,)
+    taken_in: Ints  # (n,) the last step in which a pass took it
+    of_track: Ints  # (n,) point of each track
+    free: Ints  # points that nobody has, as a stack
+    n_free: Ints  # (1,)
+
+
+def _no_points(n: int) -> _Points:
+    zeros, nothing = np.zeros((3, n), np.int64), np.full((2, n), NOTHING)
+    free = np.arange(n - 1, -1, -1)
+    return _Points(np.zeros((n, 2)), zeros[0], zeros[1], nothing[0], nothing[1], free, np.full(1, n))
+
+
 @njit(cache=True, nogil=True)
-def _align(xy_m: Floats, spread_m: Floats, class_code: Ints, first: Ints, sigma_m: Floats, order: Ints) -> Floats:  # noqa: PLR0917
-    n, n_passes = len(xy_m), first.size - 1
+def _align(passes: _Passes, order: Ints, base_var: float, points: _Points, grid: Grid) -> Floats:
+    n_passes = order.size
     offset = np.zeros((n_passes, 2))
-    point_of = np.full(n, NO_POINT)
-    room = n * (N_ROUNDS + 2)  # a round makes n new points at most
-    total, count, of_class = np.zeros((room, 2)), np.zeros(room, np.int64), np.zeros(room, np.int64)
-    n_points, base_var = 0, sigma_m[order[0]] ** 2
     for turn in range(1 + N_ROUNDS):
         n_moved = 0
         for step in range(n_passes):
             v = order[step]
-            rows = np.arange(first[v], first[v + 1])
-            for i in rows:
-                if point_of[i] != NO_POINT:
-                    count[point_of[i]] -= 1
-                    total[point_of[i]] -= xy_m[i] - offset[v]
-            near, near_start = _near(
-                xy_m, rows, total, count, n_points, REACH_SIGMAS * np.sqrt(sigma_m[v] ** 2 + base_var)
-            )
-            sigma2 = sigma_m[v] ** 2 + base_var
-            found = _best(xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start, sigma2, offset[v])
-            if step == 0 and turn == 0:
-                found = (0.0, 0.0)
-            if (found[0] - offset[v, 0]) ** 2 + (found[1] - offset[v, 1]) ** 2 > MOVED_M**2:
+            _take_out(passes, points, grid, v, offset[v])
+            sigma2 = passes.sigma2[v] + base_var
+            partners = _partners(passes, points, grid, v, REACH_SIGMAS * np.sqrt(sigma2))
+            east, north = 0.0, 0.0
+            if step > 0 or turn > 0:
+                east, north = best_offset(partners, sigma2, offset[v])
+            if (east - offset[v, 0]) ** 2 + (north - offset[v, 1]) ** 2 > MOVED_M**2:
                 n_moved += 1
-            offset[v, 0], offset[v, 1] = found
-            n_points = _lay(
-                xy_m,
-                spread_m,
-                class_code,
-                rows,
-                offset[v],
-                total,
-                count,
-                of_class,
-                near,
-                near_start,
-                point_of,
-                n_points,
-            )
+            offset[v, 0], offset[v, 1] = east, north
+            _lay(passes, points, grid, partners, v, offset[v], turn * n_passes + step)
         if turn and n_moved == 0:
             break
     return offset
 
 
 @njit(cache=True, nogil=True)
-def _near(xy_m: Floats, rows: Ints, total: Floats, count: Ints, n_points: int, reach_m: float) -> tuple[Ints, Ints]:  # noqa: PLR0917
-    """Return the points of the map within reach of each row, as CSR."""
-    low_e, low_n = xy_m[rows, 0].min() - reach_m, xy_m[rows, 1].min() - reach_m
-    high_e, high_n = xy_m[rows, 0].max() + reach_m, xy_m[rows, 1].max() + reach_m
-    inside = np.empty(n_points, np.int64)
-    n_inside = 0
-    for k in range(n_points):
-        if count[k] > 0:
-            east, north = total[k, 0] / count[k], total[k, 1] / count[k]
-            if low_e <= east <= high_e and low_n <= north <= high_n:
-                inside[n_inside] = k
-                n_inside += 1
-    inside = inside[:n_inside]
-    east_of = np.array([total[k, 0] / count[k] for k in inside])
-    by_east = np.argsort(east_of, kind="mergesort")
-    inside, east_of = inside[by_east], east_of[by_east]
-    begin = np.searchsorted(east_of, xy_m[rows, 0] - reach_m)
-    start = np.zeros(rows.size + 1, np.int64)
-    near = np.empty(rows.size * 8 + 8, np.int64)
-    n_near = 0
-    for r in range(rows.size):
-        for at in range(begin[r], n_inside):
-            east = east_of[at] - xy_m[rows[r], 0]
-            if east > reach_m:
-                break
-            north = total[inside[at], 1] / count[inside[at]] - xy_m[rows[r], 1]
-            if east * east + north * north < reach_m * reach_m:
-                if n_near == near.size:
-                    grown = np.empty(2 * near.size, np.int64)
-                    grown[:n_near] = near
-                    near = grown
-                near[n_near] = inside[at]
-                n_near += 1
-        start[r + 1] = n_near
-    return near[:n_near], start
+def _take_out(passes: _Passes, points: _Points, grid: Grid, v: int, offset: Floats) -> None:
+    """Take a pass out of the map; a point that only it had keeps its number until the pass is laid again."""
+    for i in range(passes.first[v], passes.first[v + 1]):
+        if points.of_track[i] != NOTHING:
+            _add(passes, points, grid, i, offset, -1)
 
 
 @njit(cache=True, nogil=True)
-def _around(class_code: Ints, rows: Ints, count: Ints, of_class: Ints, near: Ints, near_start: Ints) -> Ints:  # noqa: PLR0917
-    """Return how many tracks of its class lie around each row.
-
-    A point that has most of them is the likelier partner: of two copies of one map, which half of the passes made each,
-    the larger one grows, where both would last if all points were alike.
-    """
-    around = np.zeros(rows.size, np.int64)
-    for r in range(rows.size):
-        for k in near[near_start[r] : near_start[r + 1]]:
-            if of_class[k] == class_code[rows[r]]:
-                around[r] += count[k]
-    return around
+def _add(passes: _Passes, points: _Points, grid: Grid, i: int, offset: Floats, times: int) -> None:  # noqa: PLR0917 - numba takes no keyword-only arguments
+    """Add a track to its point, or take it out again."""
+    k = points.of_track[i]
+    points.n_tracks[k] += times
+    points.total[k, 0] += times * (passes.xy_m[i, 0] - offset[0])
+    points.total[k, 1] += times * (passes.xy_m[i, 1] - offset[1])
+    if points.n_tracks[k] > 0:
+        file_thing(grid, k, points.total[k, 0] / points.n_tracks[k], points.total[k, 1] / points.n_tracks[k])
+    else:
+        unfile_thing(grid, k)
 
 
 @njit(cache=True, nogil=True)
-def _gain(  # noqa: PLR0917
-    east: float,
-    north: float,
-    xy_m: Floats,
-    spread_m: Floats,
-    class_code: Ints,
-    rows: Ints,
-    total: Floats,
-    count: Ints,
-    of_class: Ints,
-    near: Ints,
-    near_start: Ints,
-    around: Ints,
-    step: int,
-) -> tuple[float, float, float]:
-    """Return the log-likelihood of an offset by every so many-th row, and the offset that their partners agree on."""
-    value, weight, sum_e, sum_n = 0.0, 1e-12, 0.0, 0.0
-    for r in range(0, rows.size, step):
-        i = rows[r]
-        var = spread_m[i] ** 2
-        best, best_e, best_n = 0.0, 0.0, 0.0
-        for at in range(near_start[r], near_start[r + 1]):
-            k = near[at]
-            de = xy_m[i, 0] - total[k, 0] / count[k]
-            dn = xy_m[i, 1] - total[k, 1] / count[k]
-            chi2 = ((de - east) ** 2 + (dn - north) ** 2) / var
-            if chi2 < PARTNER_CHI2:
-                density = np.exp(-chi2 / 2) / (2 * np.pi * var * SIGN_DENSITY_M2)
-                if of_class[k] == class_code[i]:
-                    density *= (count[k] + 1) / (around[r] - count[k] + 1)
-                else:
-                    density *= OTHER_CLASS
-                if density > best:
-                    best, best_e, best_n = density, de, dn
-        value += np.log1p(best)
-        share = best / (1 + best) / var
-        weight += share
-        sum_e += share * best_e
-        sum_n += share * best_n
-    return value, sum_e / weight, sum_n / weight
+def _apart(passes: _Passes, points: _Points, i: int, k: int) -> tuple[float, float]:
+    """Return the offset that brings a track onto a point."""
+    return (
+        passes.xy_m[i, 0] - points.total[k, 0] / points.n_tracks[k],
+        passes.xy_m[i, 1] - points.total[k, 1] / points.n_tracks[k],
+    )
 
 
 @njit(cache=True, nogil=True)
-def _best(  # noqa: PLR0917
-    xy_m: Floats,
-    spread_m: Floats,
-    class_code: Ints,
-    rows: Ints,
-    total: Floats,
-    count: Ints,
-    of_class: Ints,
-    near: Ints,
-    near_start: Ints,
-    sigma2: float,
-    offset: Floats,
-) -> tuple[float, float]:
-    """Return the likeliest offset, among those that bring a row onto a point of its class and the present one."""
-    best, found_e, found_n = -np.inf, offset[0], offset[1]
-    candidates = _candidates(xy_m, class_code, rows, total, count, of_class, near, near_start, offset)
-    around = _around(class_code, rows, count, of_class, near, near_start)
-    step = 1 + rows.size // ENOUGH_ROWS
-    for at in range(len(candidates)):
-        east, north = candidates[at]
-        for _ in range(2):  # as it stands, and where its partners pull it
-            value, pulled_e, pulled_n = _gain(
-                east, north, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start, around, step
-            )
-            value -= (east * east + north * north) / (2 * sigma2)
-            if value > best:
-                best, found_e, found_n = value, east, north
-            east, north = pulled_e, pulled_n
-    if step > 1:
-        _, found_e, found_n = _gain(
-            found_e, found_n, xy_m, spread_m, class_code, rows, total, count, of_class, near, near_start, around, 1
-        )
-    return found_e, found_n
-
-
-@njit(cache=True, nogil=True)
-def _candidates(  # noqa: PLR0917
-    xy_m: Floats,
-    class_code: Ints,
-    rows: Ints,
-    total: Floats,
-    count: Ints,
-    of_class: Ints,
-    near: Ints,
-    near_start: Ints,
-    offset: Floats,
-) -> Floats:
-    """Return the present offset, and those that bring a row onto a point of its class, (n, 2).
-
-    Of many, one each of the cells of offsets that most rows vote for: a long pass costs no more than its rows.
-    """
-    found = np.empty((near.size + 1, 2))
-    found[0] = offset
-    n = 1
-    for r in range(rows.size):
-        for at in range(near_start[r], near_start[r + 1]):
-            k, i = near[at], rows[r]
-            if of_class[k] == class_code[i]:
-                found[n, 0] = xy_m[i, 0] - total[k, 0] / count[k]
-                found[n, 1] = xy_m[i, 1] - total[k, 1] / count[k]
+def _partners(passes: _Passes, points: _Points, grid: Grid, v: int, reach_m: float) -> Partners:
+    """Return the points of the map within reach of each track of a pass, those of a track from west to east."""
+    a, b = passes.first[v], passes.first[v + 1]
+    start, point, found = np.zeros(b - a + 1, np.int64), np.empty(8 * (b - a) + 8, np.int64), np.empty(64, np.int64)
+    n = 0
+    for i in range(a, b):
+        found, n_found = things_around(grid, passes.xy_m[i, 0], passes.xy_m[i, 1], found)
+        for at in range(n_found):
+            de, dn = _apart(passes, points, i, found[at])
+            if de * de + dn * dn < reach_m * reach_m:
+                if n == point.size:
+                    point = longer(point)
+                _put_by_east(points, point, start[i - a], n, found[at])
                 n += 1
-    found = found[:n]
-    if n <= FEW_OFFSETS:
-        return found
-    low_e, low_n = found[:, 0].min() - 2 * VOTE_CELL_M, found[:, 1].min() - 2 * VOTE_CELL_M
-    column = ((found[:, 0] - low_e) / VOTE_CELL_M).astype(np.int64)
-    row = ((found[:, 1] - low_n) / VOTE_CELL_M).astype(np.int64)
-    votes = np.zeros((row.max() + 3, column.max() + 3), np.int64)
-    for at in range(1, n):  # a cell and those around it, so that no border parts those who agree
-        votes[row[at] - 1 : row[at] + 2, column[at] - 1 : column[at] + 2] += 1
-    kept = [0]
-    for at in np.argsort(np.array([-votes[row[at], column[at]] for at in range(n)]), kind="mergesort"):
-        if votes[row[at], column[at]] > 0 and at > 0:
-            kept.append(at)
-            votes[row[at], column[at]] = 0  # its other offsets are as good as this one
-        if len(kept) > VOTED_OFFSETS:
-            break
-    chosen: Floats = found[np.array(kept)]
-    return chosen
+        start[i - a + 1] = n
+    partners = Partners(
+        start,
+        point[:n],
+        np.empty((n, 2)),
+        np.empty(n, np.bool_),
+        np.full(n, OTHER_CLASS),
+        np.empty(n),
+        passes.spread_m[a:b] ** 2,
+    )
+    for i in range(a, b):
+        _weigh(passes, points, partners, i, i - a)
+    return partners
 
 
 @njit(cache=True, nogil=True)
-def _lay(  # noqa: PLR0917
-    xy_m: Floats,
-    spread_m: Floats,
-    class_code: Ints,
-    rows: Ints,
-    offset: Floats,
-    total: Floats,
-    count: Ints,
-    of_class: Ints,
-    near: Ints,
-    near_start: Ints,
-    point_of: Ints,
-    n_points: int,
-) -> int:
-    """Add the rows of a pass to the map: to the nearest free point of their class, or as new points."""
-    is_taken = np.zeros(n_points + rows.size, np.bool_)  # a point that a row of this pass has is not free
-    for r in range(rows.size):
-        i = rows[r]
-        best, reach2 = NO_POINT, (3 * spread_m[i]) ** 2
-        for at in range(near_start[r], near_start[r + 1]):
-            k = near[at]
-            if of_class[k] == class_code[i] and not is_taken[k]:
-                de = xy_m[i, 0] - offset[0] - total[k, 0] / count[k]
-                dn = xy_m[i, 1] - offset[1] - total[k, 1] / count[k]
-                if de * de + dn * dn < reach2:
-                    best, reach2 = k, de * de + dn * dn
-        if best == NO_POINT:
-            if point_of[i] != NO_POINT and count[point_of[i]] == 0:
-                best = point_of[i]
+def _put_by_east(points: _Points, point: Ints, begin: int, end: int, new: int) -> None:
+    """Insert a point into a part of the list that is sorted by east, of equals by number."""
+    east, at = points.total[new, 0] / points.n_tracks[new], end
+    while at > begin:
+        k = point[at - 1]
+        other = points.total[k, 0] / points.n_tracks[k]
+        if other < east or (other == east and k < new):
+            break
+        point[at] = k
+        at -= 1
+    point[at] = new
+
+
+@njit(cache=True, nogil=True)
+def _weigh(passes: _Passes, points: _Points, partners: Partners, i: int, r: int) -> None:
+    """Say where the partners of a track are, and how much each counts.
+
+    A point that has most of the tracks of the class around is the likelier partner: of two copies of one map, which
+    half of the passes made each, the larger one grows, where both would last if all points were alike.
+    """
+    around = 0
+    for at in range(partners.start[r], partners.start[r + 1]):
+        k = partners.point[at]
+        partners.apart_m[at, 0], partners.apart_m[at, 1] = _apart(passes, points, i, k)
+        partners.is_same[at] = points.class_code[k] == passes.class_code[i]
+        if partners.is_same[at]:
+            around += points.n_tracks[k]
+    for at in range(partners.start[r], partners.start[r + 1]):
+        count = points.n_tracks[partners.point[at]]
+        if partners.is_same[at]:
+            partners.weight[at] = (count + 1) / (around - count + 1)
+        partners.most[at] = 1 / (2 * np.pi * partners.var[r] * SIGN_DENSITY_M2) * partners.weight[at]
+
+
+@njit(cache=True, nogil=True)
+def _lay(  # noqa: PLR0917 - numba takes no keyword-only arguments
+    passes: _Passes, points: _Points, grid: Grid, partners: Partners, v: int, offset: Floats, step: int
+) -> None:
+    """Add the tracks of a pass to the map: to the nearest free point of their class, or as new points."""
+    for r in range(partners.var.size):
+        i = passes.first[v] + r
+        k, own = _nearest_free(passes, points, partners, i, r, offset, step), points.of_track[i]
+        is_own_left = own != NOTHING and points.n_tracks[own] == 0
+        if k == NOTHING:
+            if is_own_left:
+                k = own
             else:
-                best, n_points = n_points, n_points + 1
-            total[best] = 0.0
-            of_class[best] = class_code[i]
-        is_taken[best] = True
-        point_of[i] = best
-        total[best] += xy_m[i] - offset
-        count[best] += 1
-    return n_points
+                points.n_free[0] -= 1
+                k = points.free[points.n_free[0]]
+            points.total[k, 0], points.total[k, 1] = 0.0, 0.0
+            points.class_code[k] = passes.class_code[i]
+        elif is_own_left:
+            points.free[points.n_free[0]] = own
+            points.n_free[0] += 1
+        points.of_track[i], points.taken_in[k] = k, step
+        _add(passes, points, grid, i, offset, 1)
+
+
+@njit(cache=True, nogil=True)
+def _nearest_free(  # noqa: PLR0917 - numba takes no keyword-only arguments
+    passes: _Passes, points: _Points, partners: Partners, i: int, r: int, offset: Floats, step: int
+) -> int:
+    """Return the nearest point of its class that no other track of the pass has, `NOTHING` without one."""
+    best, reach2 = NOTHING, (3 * passes.spread_m[i]) ** 2
+    for at in range(partners.start[r], partners.start[r + 1]):
+        k = partners.point[at]
+        if partners.is_same[at] and points.taken_in[k] != step:
+            de = passes.xy_m[i, 0] - offset[0] - points.total[k, 0] / points.n_tracks[k]
+            dn = passes.xy_m[i, 1] - offset[1] - points.total[k, 1] / points.n_tracks[k]
+            if de * de + dn * dn < reach2:
+                best, reach2 = k, de * de + dn * dn
+    return best

@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 
 from geofleet.algorithms.assignment import _assign, _Graph  # the compiled core: one call a pass
+from geofleet.algorithms.joint_grid import Grid, file_thing, grid_around, longer, things_around, unfile_thing
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -52,17 +53,7 @@ class Signs(NamedTuple):
     vector: Floats  # (room, 2), about `Places` as they are
     log_class: Floats  # (room, n_classes) log-likelihood of its tracks under every class
     n_tracks: Ints  # (room,)
-    cell: Ints  # (room,) where it is filed, -1 for nowhere
-    following: Ints  # (room,) the next sign in its cell, -1 at the end
-
-
-class _Grid(NamedTuple):
-    """Signs filed by cells that some track lies in or beside."""
-
-    keys: Ints  # sorted
-    head: Ints  # first sign of each cell
-    low: Floats
-    width: int
+    place: Floats  # (room, 5): east, north and covariance (ee, nn, en) that follow from these
 
 
 def sweep(places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, *, birth_cost: float) -> Ints:
@@ -85,12 +76,14 @@ def sweep(places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, 
     -------
     (n,) sign of each track, numbered from 0 by their first track.
     """
-    grid = _grid(places.xy_m)
-    found: Ints = _sweep(places, sign.copy(), log_confusion, log_prior, birth_cost, grid)
+    room = max(len(sign), int(sign.max(initial=-1)) + 1) + 1
+    grid = grid_around(places.xy_m, REACH_M, room)
+    signs = _no_signs(room, len(log_prior))
+    found: Ints = _sweep(places, sign.copy(), signs, log_confusion, log_prior, birth_cost, grid)
     numbered = np.unique(found, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(numbered[1], kind="stable"), kind="stable")
-    signs: Ints = rank[numbered[2]].astype(np.int64)
-    return signs
+    renumbered: Ints = rank[numbered[2]].astype(np.int64)
+    return renumbered
 
 
 def leaders(sign: Ints) -> Ints:
@@ -102,13 +95,15 @@ def leaders(sign: Ints) -> Ints:
     return lead
 
 
-def _grid(xy_m: Floats) -> _Grid:
-    low = xy_m.min(axis=0) - 2 * REACH_M
-    cell = np.floor((xy_m - low) / REACH_M).astype(np.int64)
-    width = int(cell[:, 0].max()) + 3
-    around = np.array([row * width + column for row in (-1, 0, 1) for column in (-1, 0, 1)])
-    keys = np.unique((cell[:, 1] * width + cell[:, 0])[:, None] + around)  # the mean of tracks may lie a cell on
-    return _Grid(keys, np.full(len(keys), NO_SIGN), low, width)
+def _no_signs(room: int, n_classes: int) -> Signs:
+    """Return room for signs; of an array of zeros only what is written to takes memory."""
+    return Signs(
+        np.zeros((room, 3)),
+        np.zeros((room, 2)),
+        np.zeros((room, n_classes)),
+        np.zeros(room, np.int64),
+        np.zeros((room, 5)),
+    )
 
 
 class _Free(NamedTuple):
@@ -120,9 +115,9 @@ class _Free(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _sweep(  # noqa: PLR0917 - numba takes no keyword-only arguments
-    places: Places, sign: Ints, log_confusion: Floats, log_prior: Floats, birth_cost: float, grid: _Grid
+    places: Places, sign: Ints, signs: Signs, log_confusion: Floats, log_prior: Floats, birth_cost: float, grid: Grid
 ) -> Ints:
-    signs, free = _start(places, sign, log_confusion, grid)
+    free = _start(places, sign, signs, log_confusion, grid)
     local = np.full(signs.n_tracks.size, -1)
     for v in range(places.first.size - 1):
         a, b = places.first[v], places.first[v + 1]
@@ -139,42 +134,34 @@ def _sweep(  # noqa: PLR0917 - numba takes no keyword-only arguments
                 signs.information[k], signs.vector[k], signs.log_class[k] = 0.0, 0.0, 0.0
             sign[i] = k
             _add(signs, places, log_confusion, i, k, 1)
-            if signs.cell[k] < 0:
-                _file(signs, grid, k)
+            if grid.cell[k] < 0:  # filed once: its tracks move it by less than what the cells around reach beyond them
+                file_thing(grid, k, signs.place[k, 0], signs.place[k, 1])
     return sign
 
 
 @njit(cache=True, nogil=True)
-def _start(places: Places, sign: Ints, log_confusion: Floats, grid: _Grid) -> tuple[Signs, _Free]:
-    """Return the map of the tracks that have a sign, filed, and the signs that are free."""
-    room = max(len(sign), sign.max() + 1) + 1
-    signs = Signs(
-        np.zeros((room, 3)),
-        np.zeros((room, 2)),
-        np.zeros((room, log_confusion.shape[1])),
-        np.zeros(room, np.int64),
-        np.full(room, -1),
-        np.full(room, NO_SIGN),
-    )
+def _start(places: Places, sign: Ints, signs: Signs, log_confusion: Floats, grid: Grid) -> _Free:
+    """File the signs of the tracks that have one, and return the signs that are free."""
     for i in range(len(sign)):
         if sign[i] != NO_SIGN:
             _add(signs, places, log_confusion, i, sign[i], 1)
+    room = signs.n_tracks.size
     free = _Free(np.empty(room, np.int64), np.zeros(1, np.int64))
     for k in range(room - 1, -1, -1):
         if signs.n_tracks[k] == 0:
             free.stack[free.size[0]] = k
             free.size[0] += 1
         else:
-            _file(signs, grid, k)
-    return signs, free
+            file_thing(grid, k, signs.place[k, 0], signs.place[k, 1])
+    return free
 
 
 @njit(cache=True, nogil=True)
-def _give_up(signs: Signs, grid: _Grid, free: _Free, before: Ints) -> None:
+def _give_up(signs: Signs, grid: Grid, free: _Free, before: Ints) -> None:
     """Free the signs that a pass was the only witness of."""
     for k in before:
-        if k != NO_SIGN and signs.n_tracks[k] == 0 and signs.cell[k] >= 0:
-            _unfile(signs, grid, k)
+        if k != NO_SIGN and signs.n_tracks[k] == 0 and grid.cell[k] >= 0:
+            unfile_thing(grid, k)
             free.stack[free.size[0]] = k
             free.size[0] += 1
 
@@ -192,48 +179,12 @@ def _add(signs: Signs, places: Places, log_confusion: Floats, i: int, k: int, ti
     signs.vector[k, 1] += times * (wen * places.xy_m[i, 0] + wnn * places.xy_m[i, 1])
     signs.log_class[k] += times * log_confusion[places.kind_code[i], :, places.class_code[i]]
     signs.n_tracks[k] += times
-
-
-@njit(cache=True, nogil=True)
-def _place(signs: Signs, k: int) -> tuple[float, float, float, float, float]:
-    """Return east, north and the covariance (ee, nn, en) of a sign."""
-    a, b, c = signs.information[k]
-    det = a * b - c * c
-    e, n = signs.vector[k]
-    return (b * e - c * n) / det, (a * n - c * e) / det, b / det, a / det, -c / det
-
-
-@njit(cache=True, nogil=True)
-def _cell_of(grid: _Grid, column: int, row: int) -> int:
-    """Return the number of a cell, -1 far from all tracks."""
-    key = row * grid.width + column
-    at = np.searchsorted(grid.keys, key)
-    return int(at) if at < grid.keys.size and grid.keys[at] == key else -1
-
-
-@njit(cache=True, nogil=True)
-def _file(signs: Signs, grid: _Grid, k: int) -> None:
-    """File a sign under the cell of its place; far from all tracks, under the nearest file there is."""
-    east, north, _, _, _ = _place(signs, k)
-    column = int(np.floor((east - grid.low[0]) / REACH_M))
-    row = int(np.floor((north - grid.low[1]) / REACH_M))
-    at = min(int(np.searchsorted(grid.keys, row * grid.width + column)), grid.keys.size - 1)
-    signs.cell[k] = at
-    signs.following[k] = grid.head[at]
-    grid.head[at] = k
-
-
-@njit(cache=True, nogil=True)
-def _unfile(signs: Signs, grid: _Grid, k: int) -> None:
-    at = signs.cell[k]
-    signs.cell[k] = -1
-    if grid.head[at] == k:
-        grid.head[at] = signs.following[k]
-        return
-    other = grid.head[at]
-    while signs.following[other] != k:
-        other = signs.following[other]
-    signs.following[other] = signs.following[k]
+    if signs.n_tracks[k] > 0:
+        a, b, c = signs.information[k]
+        det = a * b - c * c
+        e, n = signs.vector[k]
+        signs.place[k, 0], signs.place[k, 1] = (b * e - c * n) / det, (a * n - c * e) / det
+        signs.place[k, 2], signs.place[k, 3], signs.place[k, 4] = b / det, a / det, -c / det
 
 
 @njit(cache=True, nogil=True)
@@ -265,7 +216,7 @@ class _Pairs(NamedTuple):
 def _assign_pass(  # noqa: PLR0917 - numba takes no keyword-only arguments
     places: Places,
     signs: Signs,
-    grid: _Grid,
+    grid: Grid,
     local: Ints,
     a: int,
     b: int,
@@ -276,13 +227,15 @@ def _assign_pass(  # noqa: PLR0917 - numba takes no keyword-only arguments
     """Return the sign of each track of a pass (rows a to b), `NO_SIGN` for a new one; `local` is -1 all over."""
     start = np.zeros(b - a + 1, np.int64)
     column, known, cost = np.empty(64, np.int64), np.empty(64, np.int64), np.empty(64)
-    n_pairs, n_known = 0, 0
+    around, n_pairs, n_known = np.empty(64, np.int64), 0, 0
     for i in range(a, b):
-        for k in _signs_around(grid, signs, places.xy_m[i]):
-            value = _cost(places, signs, i, k, log_confusion, log_prior)
+        around, n_around = things_around(grid, places.xy_m[i, 0], places.xy_m[i, 1], around)
+        for at in range(n_around):
+            k = around[at]
+            value = _cost(places, signs, i, k, log_confusion, log_prior, birth_cost)
             if value < birth_cost:
                 if n_pairs == column.size:
-                    column, known, cost = _twice(column), _twice(known), _twice_floats(cost)
+                    column, known, cost = longer(column), longer(known), np.concatenate((cost, cost))
                 if local[k] < 0:
                     local[k], known[n_known] = n_known, k
                     n_known += 1
@@ -299,39 +252,13 @@ def _assign_pass(  # noqa: PLR0917 - numba takes no keyword-only arguments
 
 
 @njit(cache=True, nogil=True)
-def _signs_around(grid: _Grid, signs: Signs, xy_m: Floats) -> list[int]:
-    """Return the signs with tracks that are filed in the cells around a place."""
-    around = [0 for _ in range(0)]
-    column = int(np.floor((xy_m[0] - grid.low[0]) / REACH_M))  # floored once: neighbours are whole steps away
-    row = int(np.floor((xy_m[1] - grid.low[1]) / REACH_M))
-    for d_row in range(-1, 2):
-        for d_column in range(-1, 2):
-            at = _cell_of(grid, column + d_column, row + d_row)
-            k = grid.head[at] if at >= 0 else NO_SIGN
-            while k != NO_SIGN:
-                if signs.n_tracks[k] > 0:
-                    around.append(k)
-                k = signs.following[k]
-    return around
-
-
-@njit(cache=True, nogil=True)
-def _twice(values: Ints) -> Ints:
-    grown = np.empty(2 * values.size, np.int64)
-    grown[: values.size] = values
-    return grown
-
-
-@njit(cache=True, nogil=True)
-def _twice_floats(values: Floats) -> Floats:
-    grown = np.empty(2 * values.size)
-    grown[: values.size] = values
-    return grown
-
-
-@njit(cache=True, nogil=True)
-def _cost(places: Places, signs: Signs, i: int, k: int, log_confusion: Floats, log_prior: Floats) -> float:  # noqa: PLR0917 - numba takes no keyword-only arguments
-    east, north, ee, nn, en = _place(signs, k)
+def _cost(  # noqa: PLR0917 - numba takes no keyword-only arguments
+    places: Places, signs: Signs, i: int, k: int, log_confusion: Floats, log_prior: Floats, most: float
+) -> float:
+    """Return what it costs a track to join a sign, infinite where that is `most` or more whatever it is read as."""
+    if signs.n_tracks[k] == 0:
+        return np.inf
+    east, north, ee, nn, en = signs.place[k]
     de, dn = places.xy_m[i, 0] - east, places.xy_m[i, 1] - north
     if de * de + dn * dn > REACH_M**2:
         return np.inf
@@ -340,9 +267,11 @@ def _cost(places: Places, signs: Signs, i: int, k: int, log_confusion: Floats, l
     chi2 = (nn * de * de - 2 * en * de * dn + ee * dn * dn) / det
     if chi2 > GATE_CHI2:
         return np.inf
-    read = log_confusion[places.kind_code[i], :, places.class_code[i]]
     spatial = 0.5 * chi2 + np.log(2 * np.pi) + 0.5 * np.log(det)
     usual = _usual(places.n_around[i], signs.n_tracks[k])
+    if spatial - usual >= most:
+        return np.inf
+    read = log_confusion[places.kind_code[i], :, places.class_code[i]]
     return float(spatial + class_cost(signs.log_class[k], log_prior, read) - usual)
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import sparse
 
 from geofleet.algorithms import joint_evidence as evidence
 from geofleet.algorithms.joint_alignment import align_passes
@@ -310,14 +311,19 @@ def _passes_around(xy_m: Floats, pass_code: Ints) -> Ints:
         return np.zeros(0, np.int64)
     cell = np.floor((xy_m - xy_m.min(axis=0)) / REACH_M).astype(np.int64) + 1
     width = int(cell[:, 0].max()) + 2
-    n_passes = int(pass_code.max()) + 1
-    key = cell[:, 1] * width + cell[:, 0]
-    taken = np.unique(key * n_passes + pass_code)  # passes of each cell, once
+    keys, at = np.unique(cell[:, 1] * width + cell[:, 0], return_inverse=True)
+    drove = _ones(at, pass_code, (len(keys), int(pass_code.max()) + 1))
     steps = np.array([row * width + column for row in (-1, 0, 1) for column in (-1, 0, 1)])
-    spread = np.unique((taken // n_passes + steps[:, None]) * n_passes + taken % n_passes)
-    cells, count = np.unique(spread // n_passes, return_counts=True)
-    around: Ints = count[np.searchsorted(cells, key)]
+    beside = np.searchsorted(keys, keys[:, None] + steps)
+    is_there = keys[np.minimum(beside, len(keys) - 1)] == keys[:, None] + steps
+    cells = _ones(np.nonzero(is_there)[0], beside[is_there], (len(keys), len(keys)))
+    around: Ints = np.diff((cells @ drove).indptr)[at].astype(np.int64)
     return around
+
+
+def _ones(row: Ints, column: Ints, shape: tuple[int, int]) -> sparse.csr_array:
+    """Return a sparse matrix that is not zero at these places."""
+    return sparse.csr_array(sparse.coo_array((np.ones(len(row)), (row, column)), shape=shape))
 
 
 def _share_of_tight(wide: Solution, sigmas_m: tuple[float, float]) -> float:
