@@ -1,6 +1,6 @@
 """OpenStreetMap's PBF, read a block at a time: https://wiki.openstreetmap.org/wiki/PBF_Format.
 
-Blocks are unpacked on threads of their own and decoded as arrays, numbers of a block at once. Blocks that cannot hold
+Blocks are unpacked and decoded on threads of their own, as arrays, numbers of a block at once. Blocks that cannot hold
 what is looked for are passed over by a search in their string table, so that a file is read about as fast as it
 unpacks, and memory holds a few blocks whatever its size.
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Block", "DenseNodes", "Strings", "UnusualPbfError", "read_blocks"]
 
-_THREADS, _AHEAD = 2, 4
+_THREADS, _AHEAD = 2, 6
 _NANO_PER_E7 = 100
 _NEWLINE = 0x0A  # field 1, bytes
 _HEAD = 3  # bytes by which strings are looked up
@@ -220,7 +220,8 @@ class Block:
 def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = False) -> Iterator[_T]:
     """Yield what `work` makes of every block of a file, in the order of the file.
 
-    Blocks of ways and relations come without their content with `nodes_only`, which spares unpacking it.
+    `work` runs on threads, beside what the caller does with what it made: most of both is zlib's and numpy's, which let
+    others run. Blocks of ways and relations come without their content with `nodes_only`, which spares unpacking it.
 
     Raises
     ------
@@ -229,22 +230,25 @@ def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = F
     UnusualPbfError
         The file is valid and not read here.
     """
+
+    def made(blob: bytes) -> _T:
+        return work(Block(unpack(blob, nodes_only=nodes_only)))
+
     with path.open("rb") as file, ThreadPoolExecutor(_THREADS) as pool:
-        # Threads unpack only: zlib runs beside Python, while decoding in several threads would wait for the lock.
-        waiting: deque[tuple[int, Future[bytes]]] = deque()
+        waiting: deque[tuple[int, Future[_T]]] = deque()
         at = 0
         try:
             for begin, kind, blob in read_blobs(file):
                 if kind == b"OSMHeader":
                     check_features(unpack(blob))
                 elif kind == b"OSMData":
-                    waiting.append((begin, pool.submit(unpack, blob, nodes_only=nodes_only)))
+                    waiting.append((begin, pool.submit(made, blob)))
                 if len(waiting) >= _AHEAD:
                     at, done = waiting.popleft()
-                    yield work(Block(done.result()))
+                    yield done.result()
             while waiting:
                 at, done = waiting.popleft()
-                yield work(Block(done.result()))
+                yield done.result()
         except (DamagedPbfError, zlib.error, IndexError, OverflowError) as error:
             raise InputError(
                 f"damaged, or not an OpenStreetMap file ({error}, at or after byte {at}).",

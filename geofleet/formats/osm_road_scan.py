@@ -37,7 +37,7 @@ def read_roads(pbf: Path) -> Roads:
     InputError
         The file is damaged.
     """
-    ways = _Ways.joined([found for found in read_blocks(pbf, _ways_in) if found])
+    ways = _Ways.joined([found for found in map(_ways_in, read_blocks(pbf, lambda block: block)) if found])
     way_of = np.repeat(np.arange(len(ways.way_id)), ways.n_refs)
     wanted = np.unique(ways.refs)
     index = np.searchsorted(wanted, ways.refs).astype(np.int32)

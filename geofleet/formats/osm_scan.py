@@ -129,7 +129,7 @@ def _explained(path: Path) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(error.what, where=str(path), todo=error.todo) from None
-    except (RuntimeError, ValueError, OSError, EOFError, OverflowError, MemoryError) as error:
+    except (RuntimeError, ValueError, IndexError, OSError, EOFError, OverflowError, MemoryError) as error:
         reason = str(error).strip().rstrip(".") or type(error).__name__
         raise InputError(
             f"damaged, or not an OpenStreetMap file ({reason}).",
@@ -177,9 +177,9 @@ def sign_nodes(pbf: Path) -> SignNodes:
     tagsets: dict[bytes, int] = {}
     spool = NodeSpool()
     has_nodes = False
-    for groups in read_blocks(pbf, _signs_in, nodes_only=True):
-        has_nodes |= groups is not None
-        for found in groups or ():
+    for block in read_blocks(pbf, _decoded, nodes_only=True):
+        has_nodes |= block is not None
+        for found in _signs_in(*block) if block else ():
             nodes = np.empty(len(found.node_id), NODE)
             nodes["node_id"], nodes["tagset"] = found.node_id, _numbered(found, known, tagsets)
             nodes["lon_e7"], nodes["lat_e7"] = _int32(found.lon_e7), _int32(found.lat_e7)
@@ -212,22 +212,24 @@ def _int32(e7: Ints) -> NDArray[np.int32]:
     return np.clip(e7, -limit, limit).astype(np.int32)
 
 
-def _signs_in(block: Block) -> list[_Found] | None:
-    """Return the sign nodes of a block, None when it holds no nodes at all."""
+def _decoded(block: Block) -> tuple[Strings, list[DenseNodes]] | tuple[()] | None:
+    """Return the strings and nodes of a block, nothing where none has signs; None when it holds no nodes at all."""
     if not block.has_nodes():
         return None
     if not any(map(block.holds_string, _MARKS)):
-        return []
-    strings = block.strings
+        return ()
+    return block.strings, list(block.dense_nodes())
+
+
+def _signs_in(strings: Strings, groups: list[DenseNodes]) -> Iterator[_Found]:
+    """Yield the sign nodes of each group of a block."""
     key_role, is_word, highway = _roles(strings)
-    groups = []
-    for nodes in block.dense_nodes():
+    for nodes in groups:
         if len(nodes.keys_vals):
             chosen, counts, tags = _sign_tags(nodes, key_role, is_word, highway)
             used = np.flatnonzero(np.bincount(tags.ravel()))
             place = (nodes.node_id[chosen], nodes.lon_e7[chosen], nodes.lat_e7[chosen])
-            groups.append(_Found(*place, counts, tags, used, strings.take(used)))
-    return groups
+            yield _Found(*place, counts, tags, used, strings.take(used))
 
 
 def _roles(strings: Strings) -> tuple[NDArray[np.int8], NDArray[np.bool_], int]:

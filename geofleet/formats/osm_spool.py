@@ -75,8 +75,9 @@ class NodeSpool:
             for chunk in self.chunks():
                 stretch = _stretch(borders, chunk)
                 ordered = chunk[np.argsort(stretch, kind="stable")]
-                used, n_used = np.unique(stretch, return_counts=True)
-                for number, part in zip(used.tolist(), np.split(ordered, np.cumsum(n_used)[:-1]), strict=True):
+                n_each = np.bincount(stretch)
+                used = np.flatnonzero(n_each)
+                for number, part in zip(used.tolist(), np.split(ordered, np.cumsum(n_each[used])[:-1]), strict=True):
                     dealt.seek(int(at[number]) * NODE.itemsize)
                     dealt.write(part.tobytes())
                     at[number] += len(part)
