@@ -72,10 +72,10 @@ def test_two_cars_and_three_signs_by_hand() -> None:
     np.testing.assert_allclose(found.cov_m2, np.array([0.85, 0.625, 0.85])[:, None, None] * np.eye(2), atol=1e-9)
 
 
-def with_bias(seed: int = 3) -> tuple[Tracks, Passes, Ints, int]:
+def with_bias(n_signs: int = 7, seed: int = 3) -> tuple[Tracks, Passes, Ints, int]:
     """Return tracks that bind place and bias together, of an association that is known."""
     rng = np.random.default_rng(seed)
-    n_passes, n_signs = 5, 7
+    n_passes = 5
     code, sign = (a.ravel() for a in np.indices((n_passes, n_signs)))
     n = len(code)
     bias_sigma = np.tile([2.0, 0.05], (n_passes, 1))
@@ -113,12 +113,15 @@ def dense(tracks: Tracks, passes: Passes, sign: Ints, n_signs: int) -> tuple[Flo
     return np.linalg.solve(system, right), np.linalg.inv(system)
 
 
+@pytest.mark.parametrize("dense_share", [0.05, 2.0])
 @pytest.mark.parametrize("dense_unknowns", [5000, 0])
+@pytest.mark.parametrize("n_signs", [7, 12])  # of five passes: of the more, signs are eliminated where that is dense
 def test_elimination_equals_least_squares_with_all_unknowns(
-    monkeypatch: pytest.MonkeyPatch, dense_unknowns: int
+    monkeypatch: pytest.MonkeyPatch, n_signs: int, dense_unknowns: int, dense_share: float
 ) -> None:
     monkeypatch.setattr(joint_solution, "DENSE_UNKNOWNS", dense_unknowns)
-    tracks, passes, sign, n_signs = with_bias()
+    monkeypatch.setattr(joint_solution, "DENSE_SHARE", dense_share)
+    tracks, passes, sign, _ = with_bias(n_signs)
     found = solve(tracks, passes, sign, n_signs, np.zeros((5, 4)), with_cov=True, marginal_of=2)
     x, cov = dense(tracks, passes, sign, n_signs)
     np.testing.assert_allclose(found.xy_m.ravel(), x[: 2 * n_signs], atol=1e-8)
@@ -129,6 +132,19 @@ def test_elimination_equals_least_squares_with_all_unknowns(
     third = slice(2 * n_signs + 8, 2 * n_signs + 12)
     assert found.marginal_cov is not None
     np.testing.assert_allclose(found.marginal_cov, cov[third, third], atol=1e-9)
+
+
+def test_covariances_of_signs_that_nothing_couples_are_found_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each pass here reports a sign or two: what the sparse solver finds part by part, the dense one finds at once."""
+    rng = np.random.default_rng(4)
+    sign = np.array([0, 1, 1, 2, 3, 3, 4, 5])
+    passes = np.array([0, 0, 1, 2, 3, 4, 5, 5])
+    tracks = point_tracks(passes, np.zeros(8, np.int64), rng.normal(0, 50, (8, 2)), 0.3)
+    whole = solve(tracks, plain_passes(6), sign, 6, np.zeros((6, 4)), with_cov=True)
+    monkeypatch.setattr(joint_solution, "DENSE_UNKNOWNS", 0)
+    by_part = solve(tracks, plain_passes(6), sign, 6, np.zeros((6, 4)), with_cov=True)
+    np.testing.assert_allclose(by_part.cov_m2, whole.cov_m2, atol=1e-9)
+    np.testing.assert_allclose(by_part.xy_m, whole.xy_m, atol=1e-9)
 
 
 def test_where_it_is_expanded_about_does_not_matter() -> None:
