@@ -233,7 +233,7 @@ def direction(score: str) -> Direction:
 def check_level(level: float) -> None:
     """Raise InputError unless the level is a share between 0 and 1."""
     if not 0 < level < 1:
-        raise InputError(f"the level is {level}", where="interval", todo="Give a share between 0 and 1, e.g. 0.95.")
+        raise InputError(f"the level is {level}.", where="interval", todo="Give a share between 0 and 1, e.g. 0.95.")
 
 
 def _scores(scores: Sequence[float | None] | Floats) -> Floats:

@@ -54,7 +54,7 @@ class _Lines:
         if now - self._last >= _SECONDS_A_LINE:
             self._last, fresh = now, done - self._first
             left = f", about {(now - self._begin) / fresh * (total - done):.0f} s left" if fresh else ""
-            sys.stderr.write(f"{self._label}: {done} of {total}{left}\n")
+            sys.stderr.write(f"{self._label}: {done} of {total} after {now - self._begin:.0f} s{left}\n")
 
 
 def print_result(result: Any, *, as_json: bool) -> None:

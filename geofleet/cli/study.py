@@ -183,6 +183,7 @@ def study_plan(
     study = _study(
         *(out, signs, [drive] if drive else None, str(config or scenario)),
         methods=method,
+        methods_option="--method",
         sizes=(max_passes,),
         settings=_with_tracker(settings, tracker),
         n_replicates=replicates,
@@ -220,7 +221,7 @@ def _study(out: Path, signs: Path | None, drives: list[Path] | None, scenarios: 
     from geofleet.workflows.study.worlds import Study, prepare_worlds
 
     methods, settings, sweep = options.pop("methods"), options.pop("settings"), options.pop("sweep", "")
-    chosen = parse_methods(methods)
+    chosen = parse_methods(methods, option=options.pop("methods_option", "--methods"))
     worlds = prepare_worlds(
         signs or raw_data() / "helsinki.osm.pbf",
         drives or [raw_data() / "helsinki_derived.pos"],

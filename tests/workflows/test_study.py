@@ -106,6 +106,22 @@ def test_what_is_there_is_not_done_again(inputs, tmp_path, monkeypatch):
     assert not list((tmp_path / "units").glob(".*"))
 
 
+def test_studies_in_one_folder_share_what_they_have_in_common(inputs, tmp_path, monkeypatch):
+    """Table 2 does not map again the fleets of Figure 5 of that size."""
+    curve = run_study(small(inputs, "dbscan"), tmp_path)
+    done, run_batch = [], units.run_batch
+
+    def noted(batch):
+        done.extend((unit.method, unit.n_vehicles, unit.replicate) for unit in batch.units)
+        return run_batch(batch)
+
+    monkeypatch.setattr(units, "run_batch", noted)
+    table = run_study(small(inputs, "dbscan,dbscan-after", sizes=(6,)), tmp_path)
+    assert sorted(done) == [("dbscan-after", 6, 0), ("dbscan-after", 6, 1)]
+    shared = [row for row in curve if row["n_vehicles"] == 6]
+    assert [row for row in table if row["method"] == "dbscan-first"] == shared
+
+
 @pytest.mark.slow
 def test_a_study_goes_on_where_it_was_killed(inputs, tmp_path):
     out = tmp_path / "study"
@@ -195,6 +211,10 @@ def test_impossible_studies_are_refused(inputs):
         small(inputs, n_replicates=0)
     with pytest.raises(ConfigError, match="--sweep"):
         worlds(inputs, sweep="semantic_rate")
+    with pytest.raises(ConfigError, match="--prior: no method here starts from a prior map"):
+        small(inputs, prior=PBF)
+    with pytest.raises(ConfigError, match="--method: unknown method"):
+        parse_methods("dbscn", option="--method")
     with pytest.raises(ConfigError, match="workers"):
         run_study(small(inputs), Path("unused-study"), n_workers=0)
 

@@ -75,8 +75,8 @@ def default_methods(*labels: str) -> str:
     return ",".join(label for label in labels if label in METHODS)
 
 
-def parse_methods(text: str) -> tuple[Method, ...]:
-    """Read `dbscan,joint,…`; a clustering alone is meant semantic first.
+def parse_methods(text: str, *, option: str = "--methods") -> tuple[Method, ...]:
+    """Read `dbscan,joint,…`, the value of an option; a clustering alone is meant semantic first.
 
     Raises
     ------
@@ -89,9 +89,9 @@ def parse_methods(text: str) -> tuple[Method, ...]:
         if label not in METHODS:
             near = difflib.get_close_matches(name, [*CLUSTERING, *METHODS], n=1)
             todo = f"Did you mean {near[0]}?" if near else f"Methods are {', '.join(METHODS)}."
-            raise ConfigError(f"unknown method {name!r}.", where="--methods", todo=todo)
+            raise ConfigError(f"unknown method {name!r}.", where=option, todo=todo)
     if not labels:
-        raise ConfigError("no method is named.", where="--methods", todo=f"Methods are {', '.join(METHODS)}.")
+        raise ConfigError("no method is named.", where=option, todo=f"Methods are {', '.join(METHODS)}.")
     return tuple(METHODS[label] for label in dict.fromkeys(labels))
 
 

@@ -83,6 +83,8 @@ class Study:
             raise ConfigError("fleet sizes are numbers from 1.", where="--vehicles", todo="Example: --vehicles 5,10,50")
         if self.n_replicates < 1:
             raise ConfigError(f"{self.n_replicates} replicates.", where="--replicates", todo="Give 1 or more.")
+        if self.prior is not None and not any(method.has_prior for method in self.methods):
+            raise ConfigError("no method here starts from a prior map.", where="--prior", todo="Name joint-prior.")
 
 
 def prepare_worlds(
