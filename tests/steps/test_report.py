@@ -7,11 +7,13 @@ import re
 import shutil
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
 from geofleet.config import load_config
 from geofleet.errors import ConfigError, InputError
+from geofleet.steps.aggregate import aggregate
 from geofleet.steps.evaluate import evaluate
 from geofleet.steps.report import report
 from geofleet.steps.report.contents import read_contents
@@ -19,8 +21,8 @@ from geofleet.steps.report.scene import lay_out
 from geofleet.steps.report.statistics import FALSE, MISSED, count_confusion, error_bins
 from geofleet.steps.report.study import read_study
 from geofleet.tables.manifest import hash_path
-from geofleet.tables.schemas import SIGNS
-from geofleet.tables.store import write_table
+from geofleet.tables.schemas import NUISANCE, SIGNS
+from geofleet.tables.store import read_table, write_table
 from geofleet.workflows.demo import run_demo
 
 LARGEST_PAGE = 3_000_000  # bytes, of the demo
@@ -76,6 +78,32 @@ def test_the_page_shows_the_scores(page, demo):
     shown = read_contents(demo).shown
     assert f"<b>{shown['gospa_m']:.3f}" in page
     assert f"{shown['tp']} / {shown['fp']} / {shown['fn']}" in page
+
+
+def test_passes_of_a_joint_map_are_listed_those_far_from_what_they_declare_first(demo, tmp_path, page):
+    assert "Passes</h2>" not in page, "the demo's map is not by joint fusion"
+    config = load_config("paper", {"method": "joint"})
+    simulated = demo / "simulation"
+    aggregate(
+        simulated / "detections",
+        tmp_path / "map.parquet",
+        config=config,
+        passes=simulated / "passes.parquet",
+        n_vehicles=4,
+    )
+    found = tmp_path / "map_nuisance.parquet"
+    rows = read_table(NUISANCE, found)
+    suspect = pa.array([name == rows["pass_id"][2].as_py() for name in rows["pass_id"].to_pylist()])
+    write_table(NUISANCE, rows.set_column(rows.column_names.index("is_suspect"), "is_suspect", suspect), found)
+    evaluate(tmp_path / "map.parquet", simulated / "reference.parquet", tmp_path / "evaluation", config=config)
+    report(tmp_path, tmp_path / "report")
+    written = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    listed = re.findall(r'<tr><td><code class="whole">(v[^<]+)</code>', written)
+    assert listed[0] == f"{rows['pass_id'][2].as_py()} *"
+    assert {name.removesuffix(" *") for name in listed} == set(rows["pass_id"].to_pylist())
+    assert "1 of 4 are far from what they declare" in written
+    shutil.copy(found, tmp_path / "another_nuisance.parquet")  # of two maps: nobody says which is the one drawn
+    assert not read_contents(tmp_path).nuisance
 
 
 def test_provenance_names_inputs_hashes_seeds_and_versions(page, demo):

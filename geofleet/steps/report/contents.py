@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats.results import GEOPACKAGE
 from geofleet.tables.finding import tables_of
-from geofleet.tables.schemas import BBOX, DRIVES, LANES, MATCHES, RUNS, SCORES
+from geofleet.tables.schemas import BBOX, DRIVES, LANES, MATCHES, NUISANCE, RUNS, SCORES
 from geofleet.tables.store import read_table
 
 if TYPE_CHECKING:
@@ -47,6 +47,8 @@ class Contents:
         Tables; None where the run has none.
     runs
         Rows of `runs`: what was simulated.
+    nuisance
+        Rows of `nuisance` of the map drawn, when joint fusion made it: those farthest from what they declare first.
     manifests
         Path below the run and content of every manifest.
     inputs
@@ -66,6 +68,7 @@ class Contents:
     lanes: pa.Table | None
     drives: pa.Table | None
     runs: tuple[dict[str, Any], ...]
+    nuisance: tuple[dict[str, Any], ...]
     manifests: tuple[tuple[str, dict[str, Any]], ...]
     inputs: tuple[Path, ...]
 
@@ -102,7 +105,7 @@ def read_contents(
     totals = scores.filter(_is_total("tile") & _is_total("concept")).drop_columns(["geometry", BBOX]).to_pylist()
     shown = _choose(totals, {"run_id": run_id, "method": method, "n_vehicles": n_vehicles})
     folders = [run_dir, *sorted(path for path in run_dir.iterdir() if path.is_dir())]
-    found = {schema.name: tables_of(schema, folders) for schema in (LANES, DRIVES, RUNS)}
+    found = {schema.name: tables_of(schema, folders) for schema in (LANES, DRIVES, RUNS, NUISANCE)}
     package = evaluation / GEOPACKAGE
     inputs = [evaluation / "scores.parquet", matches, package, *(path for paths in found.values() for path in paths)]
     return Contents(
@@ -119,6 +122,7 @@ def read_contents(
         lanes=_all(LANES.name, found),
         drives=_all(DRIVES.name, found),
         runs=tuple(row for path in found[RUNS.name] for row in read_table(RUNS, path).to_pylist()),
+        nuisance=tuple(_nuisance(found[NUISANCE.name], shown)),
         manifests=tuple(_manifests(run_dir, folders)),
         inputs=tuple(dict.fromkeys(inputs)),
     )
@@ -201,6 +205,17 @@ def _all(name: str, found: dict[str, list[Path]]) -> pa.Table | None:
     schema = {LANES.name: LANES, DRIVES.name: DRIVES}[name]
     tables = [read_table(schema, path) for path in found[name]]
     return pa.concat_tables(tables) if tables else None
+
+
+def _nuisance(paths: list[Path], shown: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return what the passes of a map have in common; nothing where several maps of its run lie here."""
+    if not str(shown["method"]).startswith("joint"):
+        return []
+    rows = [row for path in paths for row in read_table(NUISANCE, path).to_pylist()]
+    rows = [row for row in rows if (row["run_id"] or None) == shown["run_id"]]
+    if len({row["pass_id"] for row in rows}) < len(rows):
+        return []
+    return sorted(rows, key=lambda row: (-row["is_suspect"], -row["bias_chi2"], row["pass_id"]))
 
 
 def _manifests(run_dir: Path, folders: list[Path]) -> list[tuple[str, dict[str, Any]]]:

@@ -14,12 +14,13 @@ if TYPE_CHECKING:
 
 OSM_NOTICE = "Map data © OpenStreetMap contributors, Open Database License (ODbL)."
 NOTHING = "\N{EN DASH}"
-_MOST_TILES, _MOST_ROWS = 12, 40
+_MOST_TILES, _MOST_PASSES, _MOST_ROWS = 12, 12, 40
 _SECTIONS = (
     ("map", "Map"),
     ("tiles", "Worst tiles"),
     ("errors", "Errors"),
     ("classes", "Classes"),
+    ("passes", "Passes"),
     ("fleet", "How many vehicles?"),
     ("scores", "Scores"),
     ("provenance", "Where it comes from"),
@@ -55,7 +56,7 @@ def describe(contents: Contents, scene: Scene, study: Study) -> dict[str, Any]:
         "title": title(contents),
         "badges": _badges(contents),
         "subtitle": subtitle(contents),
-        "sections": _SECTIONS,
+        "sections": [section for section in _SECTIONS if section[0] != "passes" or contents.nuisance],
         "cards": _cards(contents),
         "score_note": _score_note(contents),
         "map_note": _map_note(contents, scene),
@@ -65,6 +66,9 @@ def describe(contents: Contents, scene: Scene, study: Study) -> dict[str, Any]:
         "n_more_tiles": max(0, scene.n_tiles - _MOST_TILES),
         "errors_note": _errors_note(scene),
         "classes_note": "what has no partner is in the last column (missed) and the last row (not in the reference).",
+        "passes_note": _passes_note(contents),
+        "passes": [_pass(row) for row in contents.nuisance[:_MOST_PASSES]],
+        "n_more_passes": max(0, len(contents.nuisance) - _MOST_PASSES),
         "curves_note": _curves_note(study),
         "no_curves": _NO_CURVES,
         **_scores(contents),
@@ -206,6 +210,24 @@ def _errors_note(scene: Scene) -> str:
         text += f"{scene.n_inside} of {scene.n_with_ellipse} found signs ({share:.0%}) have their reference inside "
         text += "their 95 % error ellipse."
     return text
+
+
+def _passes_note(contents: Contents) -> str:
+    """Say how many passes are not what they declare."""
+    passes = [row for row in contents.nuisance if row["n_detections"]]  # the prior map has a row as well
+    n, n_suspect = len(passes), sum(row["is_suspect"] for row in passes)
+    text = "What joint fusion found that all detections of a pass have in common, and took out of them. "
+    if not n_suspect:
+        return f"{text}All {n} are as they declare."
+    return f"{text}{n_suspect} of {n} are far from what they declare (*): have the car looked at."
+
+
+def _pass(row: Mapping[str, Any]) -> dict[str, Any]:
+    numbers = ("offset_e_m", "offset_n_m", "range_bias_m", "bearing_bias_deg", "noise_factor", "jitter_m")
+    name = f"{row['pass_id']} *" if row["is_suspect"] else row["pass_id"]
+    return {"name": name, **{k: row[k] for k in ("sensor_kind", "n_detections")}} | {
+        k: _number(row[k], 2) for k in numbers
+    }
 
 
 def _curves_note(study: Study) -> str:
