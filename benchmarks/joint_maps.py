@@ -98,6 +98,12 @@ def known(run: Run) -> Known:
     return Known(solution.xy_m, np.linalg.inv(information), score)
 
 
+def without_common_offset(run: Run, best: Known) -> MapScore:
+    """Score the map of the known association less the offset that the fleet has in common: what is lost to that."""
+    common = (best.xy_m - run.reference_xy[run.reported]).mean(axis=0)
+    return run.score(best.xy_m - common, run.reference_code[run.reported])
+
+
 def without_translation(cov_m2: Floats) -> Floats:
     """Return a covariance of (2 n,) places with their common translation taken out."""
     n = len(cov_m2) // 2

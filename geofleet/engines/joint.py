@@ -37,8 +37,13 @@ if TYPE_CHECKING:
 
 IN_MAP = 0.5
 """A sign is in the map when its existence times its class confidence is above this: each is likelier in than out."""
-SUSPECT_CHI2 = 23.5
+SUSPECT_CHI2 = 13.8
+"""Squared standard deviations, of two unknowns, that one pass in a thousand exceeds by chance."""
 SUSPECT_NOISE = 2.0
+TOLD_PASSES = 5
+"""So many suspect passes are named in a note; the table has all."""
+PRIOR_OFF_M = 0.3
+"""A prior map that lies further off than this, three standard deviations of a good one, is told."""
 PRIOR_NAME = "prior map"
 
 
@@ -83,15 +88,16 @@ def fuse_run(task: JointTask) -> JointResult:
         fleet.tracks, fleet.passes, n_classes=len(task.classes), views=fleet.views, view_xy=fleet.view_xy, prior=prior
     )
     hashes = _hashes(task, found)
+    nuisance = _nuisance(task, fleet, found)
     in_map = found.existence * found.class_probability > IN_MAP
     if fleet.views is not None:  # what stands in a prior map where nobody drove is not this fleet's to say
         in_map &= (found.n_passes > 0) | (found.n_chances > 0)
     return JointResult(
         _clusters(task, found, frame, hashes, in_map),
         _evidence(task, fleet, found, hashes, in_map),
-        _nuisance(task, fleet, found),
+        nuisance,
         len(found.xy_m),
-        _notes(task, fleet, found),
+        _notes(task, fleet, found) + _warnings(task, nuisance),
     )
 
 
@@ -212,7 +218,8 @@ def _nuisance(task: JointTask, fleet: Fleet, found: JointMap) -> pa.Table:
     sigma = np.column_stack((fleet.passes.gnss_sigma_m, fleet.passes.gnss_sigma_m, fleet.passes.bias_sigma))
     sigma = np.concatenate((sigma, np.full((len(found.nuisance) - n_fleet, 4), np.inf)))
     nuisance = found.nuisance[rows]
-    chi2 = np.sum((nuisance / np.where(sigma[rows] > 0, sigma[rows], np.inf)) ** 2, axis=1)
+    squared = (nuisance / np.where(sigma[rows] > 0, sigma[rows], np.inf)) ** 2
+    offset_chi2, bias_chi2 = squared[:, :2].sum(axis=1), squared[:, 2:].sum(axis=1)
     extra = len(found.nuisance) - n_fleet
     noise = np.append(found.noise_factor[:n_fleet], np.ones(extra))[rows]
     kinds = [fleet.kinds[code] for code in fleet.passes.kind_code.tolist()] + [PRIOR_NAME] * extra
@@ -228,10 +235,11 @@ def _nuisance(task: JointTask, fleet: Fleet, found: JointMap) -> pa.Table:
             "offset_n_m": nuisance[:, 1],
             "range_bias_m": nuisance[:, 2],
             "bearing_bias_deg": np.rad2deg(nuisance[:, 3]),
-            "bias_chi2": chi2,
+            "offset_chi2": offset_chi2,
+            "bias_chi2": bias_chi2,
             "noise_factor": noise,
             "jitter_m": found.jitter_m[rows],
-            "is_suspect": (chi2 > SUSPECT_CHI2) | (noise > SUSPECT_NOISE),
+            "is_suspect": (np.maximum(offset_chi2, bias_chi2) > SUSPECT_CHI2) | (noise > SUSPECT_NOISE),
         },
     )
 
@@ -259,3 +267,30 @@ def _notes(task: JointTask, fleet: Fleet, found: JointMap) -> tuple[str, ...]:
             f"{task.run_id}: the association still changed after {found.n_rounds} rounds; the last one is kept."
         )
     return tuple(notes)
+
+
+def _warnings(task: JointTask, nuisance: pa.Table) -> tuple[str, ...]:
+    """Return what a user should look at: passes that are far from what they declare, and a prior map that is off."""
+    warnings = []
+    suspect = nuisance.filter(nuisance["is_suspect"]).to_pylist()
+    if suspect:
+        worst = sorted(suspect, key=lambda row: -max(row["offset_chi2"], row["bias_chi2"]))[:TOLD_PASSES]
+        told = "; ".join(
+            f"{row['pass_id']} (offset {row['offset_e_m']:+.1f} m east {row['offset_n_m']:+.1f} m north, range "
+            f"{row['range_bias_m']:+.1f} m, bearing {row['bearing_bias_deg']:+.1f}°, "
+            f"noise {row['noise_factor'] ** 0.5:.1f} times)"
+            for row in worst
+        )
+        more = f"; and {len(suspect) - len(worst)} more" if len(suspect) > len(worst) else ""
+        warnings.append(
+            f"{task.run_id}: {len(suspect)} of {nuisance.num_rows - (task.prior is not None)} passes are far from what "
+            f"they declare: {told}{more}. What the tracks of a pass "
+            "have in common is taken out, and noise lowers its weight; look at the sensor, or at its declaration."
+        )
+    warnings += [
+        f"{task.run_id}: the prior map lies {row['offset_e_m']:+.2f} m east, {row['offset_n_m']:+.2f} m north of where "
+        "the fleet sees it; it was moved by as much."
+        for row in nuisance.filter(pc.equal(nuisance["pass_id"], PRIOR_NAME)).to_pylist()
+        if np.hypot(row["offset_e_m"], row["offset_n_m"]) > PRIOR_OFF_M
+    ]
+    return tuple(warnings)

@@ -294,10 +294,11 @@ NUISANCE = Schema(
         _c("offset_n_m", FLOAT, "the same, north"),
         _c("range_bias_m", FLOAT, "what the sensor adds to every range"),
         _c("bearing_bias_deg", FLOAT, "what sensor and heading add to every bearing, counter-clockwise"),
-        _c("bias_chi2", FLOAT, "offset and biases squared in declared standard deviations, four degrees of freedom"),
+        _c("offset_chi2", FLOAT, "offset squared in declared standard deviations, two degrees of freedom"),
+        _c("bias_chi2", FLOAT, "biases squared in declared standard deviations, two degrees of freedom"),
         _c("noise_factor", FLOAT, "factor on the declared variance of its frames, from its own residuals"),
         _c("jitter_m", FLOAT, "further error of its places an axis, from how they fit the other passes"),
-        _c("is_suspect", FLAG, "far from what it declares: bias_chi2 above 23.5 (1 in 10,000), or noise doubled"),
+        _c("is_suspect", FLAG, "far from what it declares: a chi2 above 13.8 (1 in 1,000), or noise_factor above 2"),
     ),
 )
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
+from geofleet.algorithms.staleness import Staleness
 from geofleet.config import load_config
 from geofleet.errors import ConfigError, InputError
 from geofleet.steps.aggregate import aggregate, beside, explain
@@ -15,8 +17,10 @@ from geofleet.steps.evaluate import evaluate
 from geofleet.steps.ingest import ingest_drive, ingest_signs
 from geofleet.steps.ingest_detections import ingest_detections
 from geofleet.steps.simulate import simulate
-from geofleet.tables.schemas import DETECTIONS, EVIDENCE, NUISANCE, SIGNS
+from geofleet.tables.manifest import manifest_path
+from geofleet.tables.schemas import DETECTIONS, EVIDENCE, NUISANCE, PASSES, REFERENCE, SIGNS
 from geofleet.tables.store import read_table, write_table
+from geofleet.workflows.stale import stale
 
 RAW = Path(__file__).parents[2] / "data" / "raw"
 BREMEN = Path(__file__).parents[3] / "shared" / "data" / "mapillary" / "mapillary_traffic-signs_DE-HB.parquet"
@@ -71,6 +75,52 @@ def test_the_map_says_how_sure_it_is_and_what_is_behind_it(fleet, tmp_path):
     assert rows.num_rows == signs["n_detections"][0].as_py()
     with pytest.raises(InputError, match="no detection belongs"):
         explain(tmp_path / "fused.parquet", "f0")
+
+
+def test_a_car_with_a_gross_fault_is_told_and_spoils_nothing(fleet, tmp_path):
+    """Fifteen cars calibrated to 0.5 m and 0.5 degrees; some measure 10 m too far and 5 degrees askew."""
+    settings = {
+        "range_bias_sigma_m": 0.5,
+        "bearing_bias_sigma_deg": 0.5,
+        "mixed.faulty.share": 0.1,
+        "mixed.faulty.range_bias_m": 10.0,
+        "mixed.faulty.bearing_bias_deg": 5.0,
+    }
+    config = load_config("paper-ideal", {"method": "joint", "tracker": "kalman", **settings})
+    simulate(
+        fleet.parent / "signs.parquet",
+        fleet.parent / "drives.parquet",
+        tmp_path / "faulty",
+        config=config,
+        n_vehicles=15,
+        n_replicates=1,
+        seed=7,
+    )
+    out = tmp_path / "fused.parquet"
+    result = aggregate(tmp_path / "faulty/detections", out, config=config, passes=tmp_path / "faulty/passes.parquet")
+    kinds = read_table(PASSES, tmp_path / "faulty/passes.parquet").select(["pass_id", "sensor_kind"]).to_pylist()
+    faulty = {row["pass_id"] for row in kinds if row["sensor_kind"] == "faulty"}
+    rows = read_table(NUISANCE, beside(out, "nuisance")).to_pylist()
+    assert faulty
+    assert {row["pass_id"] for row in rows if row["is_suspect"]} == faulty
+    for row in rows:
+        assert row["range_bias_m"] == pytest.approx(10.0 if row["pass_id"] in faulty else 0.0, abs=2.0)
+        assert row["bearing_bias_deg"] == pytest.approx(5.0 if row["pass_id"] in faulty else 0.0, abs=2.0)
+    note = next(line for line in result.summary() if "far from what they declare" in line)
+    assert all(name in note for name in faulty)
+    assert json.loads(manifest_path(out).read_text())["counts"]["n_suspect_passes"] == len(faulty)
+    totals = evaluate(out, tmp_path / "faulty/reference.parquet", tmp_path / "evaluation", config=config).totals
+    assert totals[0]["f1"] > 0.98
+    assert totals[0]["gospa_m"] < 1.0
+
+
+def test_a_prior_map_that_is_shifted_is_told(fleet, tmp_path):
+    reference = read_table(REFERENCE, fleet / "reference.parquet")
+    first = reference.filter(pc.equal(reference["run_id"], reference["run_id"][0]))
+    write_table(REFERENCE, first, tmp_path / "scene.parquet")
+    stale(tmp_path / "scene.parquet", tmp_path / "old.parquet", Staleness(shift_m=(2.5, 0.0)))
+    result = fused(fleet, tmp_path / "fused.parquet", prior=tmp_path / "old.parquet")
+    assert sum("the prior map lies +" in line for line in result.summary()) == 2
 
 
 def test_the_same_bytes_whatever_the_workers_and_the_order_of_rows(fleet, tmp_path):

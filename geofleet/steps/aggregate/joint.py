@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from geofleet.engines.batches import concatenate
 from geofleet.engines.joint import JointTask, fuse_run
@@ -88,6 +89,7 @@ def fuse_jointly(
         n_clusters=sum(one.n_candidates for one in found),
         n_signs=n_signs,
         notes=few(staged.judged.fleet, n_vehicles) + tuple(note for one in found for note in one.notes),
+        n_suspect_passes=sum(pc.sum(one.nuisance["is_suspect"]).as_py() or 0 for one in found),
     )
     write_result_manifest(result, inputs, config)
     return result

@@ -27,7 +27,7 @@ class AggregateResult:
     """What became of the detections.
 
     `n_detections` and `n_rejected` count the whole table, `n_used` the vehicles asked for; signs are clusters with
-    enough passes.
+    enough passes. `n_suspect_passes`, of joint fusion only, are those far from what they declare.
     """
 
     out: Path
@@ -41,6 +41,7 @@ class AggregateResult:
     n_clusters: int
     n_signs: int
     notes: tuple[str, ...] = ()
+    n_suspect_passes: int | None = None
 
     def summary(self) -> list[str]:
         """Return the result in sentences."""
@@ -105,7 +106,9 @@ def few(fleet: dict[str, int], n_vehicles: int | None) -> tuple[str, ...]:
 
 def write_result_manifest(result: AggregateResult, inputs: Hashing, config: Config) -> None:
     """Write the manifest of a layer, last of all."""
-    names = ("n_vehicles", "n_detections", "n_rejected", "n_used", "n_clusters", "n_signs")
+    names = ["n_vehicles", "n_detections", "n_rejected", "n_used", "n_clusters", "n_signs"]
+    if result.n_suspect_passes is not None:  # only joint fusion looks
+        names.append("n_suspect_passes")
     write_manifest(
         result.out,
         step="aggregate",
