@@ -56,7 +56,7 @@ def main() -> None:
             n_replicates=args.replicates,
             seed=args.seed,
         )
-        passes = out / "passes" if args.with_passes else None
+        passes = out / "passes.parquet" if args.with_passes else None
         print("vehicles  share     F1   step (s.e.)        tp    fp    fn  GOSPA_M")
         before: dict[float, NDArray[np.float64]] = {}
         for size in args.sizes:
