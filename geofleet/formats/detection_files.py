@@ -1,4 +1,7 @@
-"""Rows of detections from CSV, Parquet and GeoJSON, a batch at a time: memory does not grow with CSV and Parquet."""
+"""Rows of detections from CSV, Parquet and GDAL's formats, a batch at a time.
+
+Memory does not grow with CSV and Parquet; other files are held as a whole.
+"""
 
 from __future__ import annotations
 
@@ -62,16 +65,15 @@ def read_batches(path: Path) -> Iterator[Batch]:
         The file is missing, empty, damaged or of another format.
     """
     found = detect(read_head(path))
-    readers = {"csv": _csv_batches, "parquet": _parquet_batches, "geojson": _feature_batches}
-    readers["geojsonseq"] = _feature_batches
-    if found not in readers:
+    readers = {"csv": _csv_batches, "parquet": _parquet_batches}
+    if not found:
         raise InputError(
             "no format of detections.",
             where=str(path),
-            todo="Give CSV, GeoJSON or (Geo)Parquet, with a position a row.",
+            todo="Give CSV, GeoJSON, GeoPackage, FlatGeobuf, Shapefile or (Geo)Parquet, with a position a row.",
         )
     try:
-        yield from readers[found](path)
+        yield from readers.get(found, _feature_batches)(path)
     except (pa.ArrowException, OSError, ValueError, KeyError, shapely.GEOSException) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"damaged or not {found} ({reason[:300]}).", where=str(path), todo=_AGAIN) from None

@@ -98,7 +98,7 @@ def read_detections(
     Parameters
     ----------
     path
-        CSV, GeoJSON, GeoJSON text sequence or (Geo)Parquet.
+        CSV, GeoJSON, GeoJSON text sequence, Esri JSON, GeoPackage, FlatGeobuf, Shapefile or (Geo)Parquet.
     columns
         Thing to column: `x` and `y` or `geometry`; `sign_class` or `raw_code`; any other column of the table. Or a TOML
         file with a table `columns` and, beside it, `crs`, `scheme`, `country` and `run_id`. Columns not named are

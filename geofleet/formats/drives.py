@@ -18,7 +18,7 @@ from geofleet.formats import drive_csv, drive_layout, gpx, inventory_files, nmea
 from geofleet.formats.datum import datum_of
 from geofleet.formats.drive_quality import judge_epochs
 from geofleet.formats.positions import PlaceCheck, area_doubt, reject_null_island
-from geofleet.formats.reading import BZIP2, GZIP, Datum, LayerRead, read_head
+from geofleet.formats.reading import Datum, LayerRead, content_head, read_head, unpacked
 from geofleet.formats.text_tables import is_header
 from geofleet.tables.schemas import DRIVES, TIME
 from geofleet.tables.store import build_table, lonlat
@@ -60,13 +60,11 @@ def recognise(path: Path) -> str:
     Raises
     ------
     InputError
-        The file is missing, unreadable, empty, or packed in a way that is not read.
+        The file is missing, unreadable or empty.
     """
-    head = read_head(path)
+    head = content_head(path)
     if found := detect(head):
         return found
-    if head.startswith((GZIP, BZIP2)):
-        raise InputError("a packed file, of which only GPX is read (.gpx.gz).", where=str(path), todo="Unpack it.")
     return CSV if inventory_files.detect(head) == CSV and is_header(drive_layout.columns_of(head)) else ""
 
 
@@ -84,7 +82,7 @@ def read_drive(
     Parameters
     ----------
     path
-        The file.
+        The file, which may be packed: gzip, bzip2, or a zip of it alone.
     file_format
         A key of `FORMATS`, or `auto`.
     columns, crs, origin, utm
@@ -97,9 +95,13 @@ def read_drive(
     ConfigError
         An option is unknown or meant for CSV only.
     """
+    with unpacked(path) as plain:
+        return _read_drive(plain, file_format, columns=columns, crs=crs, origin=origin, utm=utm)
+
+
+def _read_drive(path: Path, file_format: str, **given: Any) -> LayerRead:
     head = read_head(path)
     found_format = recognise(path) if file_format == "auto" else file_format
-    given = {"columns": columns, "crs": crs, "origin": origin, "utm": utm}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if file_format == "auto" and options and not found_format:
         found_format = CSV
@@ -119,7 +121,7 @@ def read_drive(
         crs = drive_csv.stated_crs(path, **options)
     else:
         epochs, skipped, *notes = readers[found_format](path)
-        drives, found = {"": epochs}, notes[0] if notes else {}
+        drives, found, crs = {"": epochs}, notes[0] if notes else {}, None
     layer = _layer(path, found_format, drives, Counter(skipped), Counter(found))
     place = lonlat(layer.table)
     check = PlaceCheck(str(path))

@@ -44,6 +44,8 @@ class InventoryColumns:
         Coordinates, for a file whose rows have no geometry.
     geometry
         Well-known text, for the same.
+    lat_lon
+        Both coordinates in one text, `60.17, 24.94`, for the same; longitude first when the column's name says so.
     first_seen, last_seen
         Dates or times.
     height
@@ -60,6 +62,7 @@ class InventoryColumns:
     x: str = ""
     y: str = ""
     geometry: str = ""
+    lat_lon: str = ""
     first_seen: str = ""
     last_seen: str = ""
     height: str = ""
@@ -78,12 +81,19 @@ _NAMES = {
     "x": "lon longitude lng long längengrad laengengrad länge x easting xcoord coordx locatiex pointx rechtswert",
     "y": "lat latitude breitengrad breite y northing ycoord coordy locatiey pointy hochwert",
     "geometry": "wkt geom geometry thegeom wktgeom shape",
+    "lat_lon": "latlon latlng latlong lonlat lnglat longlat latitudelongitude coordinates coordinate coords "
+    "koordinaten geopoint geopoint2d gps gpscoordinates gpsposition position location",
     "first_seen": "firstseen firstseenat dateinstalled installdate installed placedat",
     "last_seen": "lastseen lastseenat lastinspected inspectiondate",
     "height": "heightm mountingheight",
     "support": "supportid poleid",
 }
-_PLACES = ("x", "y", "geometry")
+_PLACES = ("x", "y", "geometry", "lat_lon")
+_PAIR = re.compile(
+    r"\s*[(\[]?\s*(?:([+-]?\d+(?:\.\d+)?)\s*,\s*([+-]?\d+(?:\.\d+)?)"
+    r"|([+-]?\d+(?:[.,]\d+)?)\s*[;/|\s]\s*([+-]?\d+(?:[.,]\d+)?))\s*[)\]]?\s*"
+)
+_LON_FIRST = re.compile(r"\s*(lon|lng)", re.IGNORECASE)
 _COMPASS_WORDS = {
     "north": 0.0, "nord": 0.0, "noord": 0.0, "east": 90.0, "ost": 90.0, "est": 90.0, "oost": 90.0, "south": 180.0,
     "süd": 180.0, "sud": 180.0, "zuid": 180.0, "west": 270.0, "ouest": 270.0, "o": 90.0, "z": 180.0,
@@ -147,9 +157,12 @@ def choose_columns(
             )
     plain = {re.sub(r"[\W_]+", "", name.lower()): name for name in reversed(names)}
     taken = set(asked.values())
-    guessed = {}
+    guessed: dict[str, str] = {}
     for thing in things:
         if thing in asked or (has_geometry and thing in _PLACES):
+            continue
+        found = asked | guessed
+        if thing == "lat_lon" and (found.get("geometry") or (found.get("x") and found.get("y"))):
             continue
         wanted = [*_NAMES[thing].split(), *_cut_names(_NAMES[thing].split(), plain)]
         free = (plain[name] for name in wanted if name in plain and plain[name] not in taken)
@@ -214,6 +227,14 @@ def coordinates(table: pa.Table, name: str) -> Floats:
         found = found.copy()
         found[lost] = [_angle(text[row] or "") for row in lost]
     return found
+
+
+def paired_coordinates(table: pa.Table, name: str) -> tuple[Floats, Floats]:
+    """Return x and y of a column of `lat, lon`, or `lon, lat` where its name begins so; NaN where it holds others."""
+    found = [_PAIR.fullmatch(text) if text else None for text in texts(table, name)]
+    pairs = [tuple(part for part in match.groups() if part) if match else ("", "") for match in found]
+    first, second = (parse_numbers([pair[side] for pair in pairs]) for side in (0, 1))
+    return (first, second) if _LON_FIRST.match(name) else (second, first)
 
 
 def _angle(text: str) -> float:

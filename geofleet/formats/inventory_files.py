@@ -32,10 +32,11 @@ _ZIP, _SQLITE, _SHP, _FGB, _PARQUET = b"PK\x03\x04", b"SQLite format 3\0", b"\x0
 _MARKS = {_SQLITE: "gpkg", _SHP: "shapefile", _FGB: "flatgeobuf", _PARQUET: "parquet", _ZIP: "shapefile.zip"}
 _SEQUENCE = re.compile(rb'(?:\x1e|\s*\{[^\n]*"Feature"[^\n]*\}\s*\n\s*\{)')
 _GEOJSON_TYPE = re.compile(rb'"type"\s*:\s*"(?:Feature|GeometryCollection|(?:Multi)?(?:Point|Line|Poly))')
+_ESRI = re.compile(rb'"geometryType"\s*:\s*"esriGeometry')
 _CRS_NAME = re.compile(
     rb'"crs"\s*:\s*\{\s*(?:"type"\s*:\s*"([a-z]+)"\s*,\s*)?"properties"\s*:\s*\{\s*"\w+"\s*:\s*"([^"]*)"'
 )
-_DRIVERS = {"geojson": "GeoJSON:", "geojsonseq": "GeoJSONSeq:"}
+_DRIVERS = {"geojson": "GeoJSON:", "geojsonseq": "GeoJSONSeq:", "esrijson": "ESRIJSON:"}
 _SUFFIXES = {"gpkg": ".gpkg", "flatgeobuf": ".fgb", "shapefile": ".shp"}  # where no prefix names the driver
 # Dates stay text: GDAL reads 1/2/2022 by its own rule, which the user cannot override
 _OPEN_OPTIONS = {"geojson": {"DATE_AS_STRING": "YES"}, "geojsonseq": {"DATE_AS_STRING": "YES"}}
@@ -85,7 +86,7 @@ def detect(head: bytes) -> str:
     if _SEQUENCE.match(text):
         return "geojsonseq"
     if text.startswith((b"{", b"[")):
-        return "geojson"
+        return "esrijson" if _ESRI.search(text) else "geojson"
     if text.startswith(b"<") or (b"\0" in head and not is_utf16):
         return ""
     return "csv" if text else ""
@@ -99,7 +100,8 @@ def read_features(
     Parameters
     ----------
     path
-        GeoJSON, GeoJSON text sequence, GeoPackage, Shapefile or a zip of one, FlatGeobuf, (Geo)Parquet or CSV.
+        GeoJSON, GeoJSON text sequence, Esri JSON, GeoPackage, Shapefile or a zip of one, FlatGeobuf, (Geo)Parquet,
+        CSV.
     layer
         Layer of a GeoPackage or zip; by default the only one with geometry.
     encoding, delimiter
@@ -132,7 +134,7 @@ def read_features(
     raise InputError(
         "no format of an inventory.",
         where=str(path),
-        todo="Give GeoJSON, GeoPackage, Shapefile, FlatGeobuf, GeoParquet or CSV.",
+        todo="Give GeoJSON, Esri JSON, GeoPackage, Shapefile, FlatGeobuf, GeoParquet or CSV.",
     )
 
 

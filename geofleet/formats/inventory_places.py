@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 
 from geofleet.errors import InputError
-from geofleet.formats.inventory_columns import coordinates, texts
+from geofleet.formats.inventory_columns import coordinates, paired_coordinates, texts
 from geofleet.formats.inventory_files import CRS84
 from geofleet.formats.positions import reject_null_island, to_lonlat
 
@@ -83,14 +83,17 @@ def place_features(
     if geometry is not None:
         feature, x, y, is_extended = _points(geometry, skipped)
     else:
-        if not (chosen.x and chosen.y):
+        if not (chosen.lat_lon or (chosen.x and chosen.y)):
             raise InputError(
                 f"no geometry, and no columns that look like coordinates; there are "
                 f"{', '.join(features.table.column_names)[:300]}.",
                 where=str(path),
-                todo="Name them: --columns x=…,y=….",
+                todo="Name them: --columns x=…,y=…, or lat_lon=… for one column of both.",
             )
-        x, y = coordinates(features.table, chosen.x), coordinates(features.table, chosen.y)
+        if chosen.lat_lon:
+            x, y = paired_coordinates(features.table, chosen.lat_lon)
+        else:
+            x, y = coordinates(features.table, chosen.x), coordinates(features.table, chosen.y)
         feature, is_extended = np.arange(len(x)), np.zeros(len(x), bool)
     x, y = (y, x) if swap_xy else (x, y)
     stated = crs or features.crs or _srid(geometry)

@@ -329,7 +329,8 @@ def _refuse_placeholders(lon: Floats, lat: Floats, x_m: Floats) -> None:
     if no_place or (len(lon) > 1 and np.ptp(lon) == 0.0 and np.ptp(lat) == 0.0):
         raise InputError(
             "positions are in local_x and local_y only; lat and lon are missing or all the same.",
-            todo="Say where they count from: --origin LAT,LON or --utm EPSG:32633,E0,N0.",
+            todo="Say where they count from: --origin LAT,LON or --utm EPSG:32633,E0,N0 (where nodes have an "
+            "mgrs_code, the UTM zone and south-west corner of its square of 100 km).",
         )
 
 

@@ -72,7 +72,7 @@ FORMATS: Mapping[str, LayerFormat] = MappingProxyType(
             lane_options=frozenset({"origin", "utm"}),
         ),
         _INVENTORY: LayerFormat(
-            "a sign inventory (GeoJSON, GeoPackage, Shapefile, FlatGeobuf, GeoParquet, CSV)",
+            "a sign inventory (GeoJSON, Esri JSON, GeoPackage, Shapefile, FlatGeobuf, GeoParquet, CSV)",
             "inventory",
         ),
     }
@@ -106,6 +106,9 @@ def recognise(path: Path) -> str:
 def unknown(path: Path) -> str:
     """Say what a file is that no reader takes."""
     head = read_head(path).lower()
+    if b"<kml" in head or b"<gml:" in head:
+        kind = "KML" if b"<kml" in head else "GML"
+        return f"{kind}, which is not read; `ogr2ogr signs.geojson {path.name}` of GDAL converts it"
     is_page = b"<html" in head or b"<!doctype html" in head
     return "a web page, such as a server sends in place of data" if is_page else "this format is not known"
 

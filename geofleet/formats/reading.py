@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import tempfile
+import zipfile
 import zlib
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, cast
 
 from geofleet.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     import pyarrow as pa
 
-GZIP, BZIP2 = b"\x1f\x8b", b"BZh"
+GZIP, BZIP2, ZIP = b"\x1f\x8b", b"BZh", b"PK\x03\x04"
 _HEAD_BYTES = 4096
+_MAX_UNPACKED_BYTES = 4 << 30
 MAX_LINE_BYTES = 1 << 20
 
 
@@ -129,12 +133,78 @@ def open_unpacked(path: Path) -> BinaryIO:
     return cast("BinaryIO", bz2.open(path)) if mark == BZIP2 else path.open("rb")
 
 
+@contextmanager
+def unpacked(path: Path) -> Iterator[Path]:
+    """Yield a file itself or, when it is packed, a copy of what is in it, in a temporary folder.
+
+    Packed are gzip, bzip2, and a zip of one file.
+
+    Raises
+    ------
+    InputError
+        What is packed is damaged or larger than any file of its kind; errors raised within name the file asked for.
+    """
+    head = read_head(path)
+    member = _only_member(path) if head.startswith(ZIP) else ""
+    if not (member or head.startswith((GZIP, BZIP2))):
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="geofleet-") as folder:
+        copy = Path(folder) / (Path(member).name or path.stem)
+        try:
+            with _open_packed(path, member) as file, copy.open("wb") as out:
+                while (chunk := file.read(MAX_LINE_BYTES)) and out.tell() <= _MAX_UNPACKED_BYTES:
+                    out.write(chunk)
+        except (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError) as error:
+            raise InputError(f"damaged: {error}.", where=str(path), todo="Fetch or pack it again.") from None
+        if chunk:
+            raise InputError("unpacks to more than 4 GiB.", where=str(path), todo="Unpack it, and check what it is.")
+        try:
+            yield copy
+        except InputError as error:
+            raise InputError(error.what, where=error.where.replace(str(copy), str(path)), todo=error.todo) from None
+
+
+def _only_member(path: Path) -> str:
+    """Return the name of the one file in a zip, "" when it holds others or is damaged."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [entry.filename for entry in archive.infolist() if not entry.is_dir()]
+    except (zipfile.BadZipFile, NotImplementedError, OSError):
+        return ""
+    names = [name for name in names if "__MACOSX" not in name]
+    return names[0] if len(names) == 1 else ""
+
+
+@contextmanager
+def _open_packed(path: Path, member: str) -> Iterator[BinaryIO]:
+    if not member:
+        with open_unpacked(path) as file:
+            yield file
+        return
+    with zipfile.ZipFile(path) as archive, archive.open(member) as inside:
+        yield cast("BinaryIO", inside)
+
+
 def unpacked_head(path: Path) -> bytes:
     """Return the first bytes of what a packed file holds, b"" when it is damaged."""
     try:
         with open_unpacked(path) as file:
             return file.read(_HEAD_BYTES)
     except (OSError, EOFError, zlib.error):
+        return b""
+
+
+def content_head(path: Path) -> bytes:
+    """Return the first bytes of what a file holds, packed or not, b"" when it is damaged; errors as `read_head`."""
+    head = read_head(path)
+    member = _only_member(path) if head.startswith(ZIP) else ""
+    if not (member or head.startswith((GZIP, BZIP2))):
+        return head
+    try:
+        with _open_packed(path, member) as file:
+            return file.read(_HEAD_BYTES)
+    except (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, NotImplementedError):
         return b""
 
 

@@ -101,7 +101,12 @@ def read_header(path: Path, encoding: str, delimiter: str | None = None) -> Head
         )
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(f"columns {', '.join(twice)[:200]} are there twice.", where=str(path), todo="Rename them.")
+        what = ", ".join(name or "without a name" for name in twice)[:200]
+        raise InputError(
+            f"columns {what} are there twice.",
+            where=str(path),
+            todo="Rename them, or take out what stands before the header; a file without one needs a header.",
+        )
     return Header(names, delimiter, n_before)
 
 

@@ -77,7 +77,8 @@ def ingest_detections(
     Parameters
     ----------
     inputs
-        CSV, GeoJSON or Parquet files; rows without a pass are numbered through all of them.
+        CSV, GeoJSON, GeoPackage, FlatGeobuf, Shapefile or Parquet files; rows without a pass are numbered through all
+        of them.
     out
         Folder to write; rows that cannot be used go to `<out>_rejected.parquet` beside it, with the reason.
     columns, crs, scheme, country, run_id
@@ -93,7 +94,9 @@ def ingest_detections(
         An option or a column is unknown.
     """
     if not inputs:
-        raise InputError("no input file is named.", todo="Give CSV, GeoJSON or Parquet files.")
+        raise InputError(
+            "no input file is named.", todo="Give CSV, GeoJSON, GeoPackage, FlatGeobuf, Shapefile or Parquet files."
+        )
     options = {"columns": columns, "crs": crs, "scheme": scheme, "country": country, "run_id": run_id}
     paths = [Path(path) for path in inputs]
     try:

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 
 from geofleet.errors import ConfigError, GeofleetError, InputError
 from geofleet.formats import layers
-from geofleet.formats.reading import LayerRead, read_head
+from geofleet.formats.reading import LayerRead, content_head, read_head
 from geofleet.tables.schemas import DETECTIONS, DRIVES, LANES, SCHEMAS, SIGNS
 from geofleet.tables.store import read_table
 
@@ -100,7 +100,7 @@ def kind_of(path: Path) -> str:
     """
     from geofleet.formats import drives  # noqa: PLC0415  (brings numba and pandas, which maps do without)
 
-    drive = drives.detect(read_head(path))
+    drive = drives.detect(content_head(path))
     if drive and drive != CSV:
         return DRIVES.name
     found = layers.recognise(path)

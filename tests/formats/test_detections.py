@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from datetime import UTC, datetime
 
+import geopandas
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -113,6 +114,21 @@ def test_options_from_a_toml_file(tmp_path):
         one(csv_file(tmp_path, "a,b,c\n8,53,stop\n"), columns={"colour": "c"})
     with pytest.raises(ConfigError, match=r"no column 'z'.*a, b, c"):
         one(csv_file(tmp_path, "a,b,c\n8,53,stop\n"), columns={"x": "z"})
+
+
+@pytest.mark.parametrize("suffix", [".gpkg", ".fgb", ".shp", ".geojson"])
+def test_detections_of_a_gis(tmp_path, suffix):
+    points = geopandas.points_from_xy([485000.0, 485100.0], [5885000.0, 5885100.0], crs="EPSG:25832")
+    frame = geopandas.GeoDataFrame({"code": ["274.1[30]", "206"], "car": [7, 8]}, geometry=points)
+    path = tmp_path / f"fleet{suffix}"
+    (frame.to_crs(4326) if suffix == ".geojson" else frame).to_file(path)
+    read = one(path, columns={"vehicle_id": "car"}, country="DE")
+    columns = (read.table["vehicle_id"].to_pylist(), read.table["sign_class"].to_pylist(), *lonlat(read.table))
+    found = {vehicle: (sign_class, x, y) for vehicle, sign_class, x, y in zip(*columns, strict=True)}
+    places = frame.to_crs(4326).get_coordinates().to_numpy()
+    for vehicle, sign_class, place in zip(("7", "8"), ("speed_zone:30", "stop"), places, strict=True):
+        assert found[vehicle][0] == sign_class
+        assert found[vehicle][1:] == pytest.approx(tuple(place), abs=1e-8)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,10 @@
 from __future__ import annotations
 
+import bz2
+import gzip
+import io
 import random
+import zipfile
 from datetime import UTC, datetime
 
 import numpy as np
@@ -13,6 +17,7 @@ from geofleet.formats.drive_quality import motion_of
 from geofleet.formats.drives import read_drive
 from geofleet.formats.gnss_time import LEAP_DAYS, gpst_to_utc
 from geofleet.tables.store import lonlat
+from geofleet.workflows.anyfile import kind_of
 
 TITLE = "%  {}                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)\n"
 TAIL = "  100.0   1   9   0.0100   0.0200   0.0300   0.0   0.0   0.0   0.00    3.0\n"
@@ -220,7 +225,7 @@ def test_motion_of_one_epoch_is_unknown(tmp_path):
         (b"", "the file is empty"),
         (b"hello\n", "not a trajectory in a format"),
         (b"a,b\n50,10\n", "no columns that look like a position; there are a, b"),
-        (b"\x1f\x8b\x08\0", "packed file"),
+        (b"\x1f\x8b\x08\0", "damaged"),
         (b"% program   : RTKLIB\n", "holds no epoch"),
         (b"% program   : RTKLIB\n1 2 3\n", "holds no epoch"),
     ],
@@ -231,6 +236,33 @@ def test_what_is_no_solution_is_refused(tmp_path, content, message):
     with pytest.raises(InputError, match=message) as caught:
         read_drive(path)
     assert str(path) in str(caught.value)
+
+
+def zipped(content: bytes) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("logs/drive.pos", content)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(("pack", "suffix"), [(gzip.compress, ".gz"), (bz2.compress, ".bz2"), (zipped, ".zip")])
+def test_a_packed_drive_is_the_drive(tmp_path, pack, suffix):
+    plain = pos(tmp_path, rows(["2023/07/11 06:04:30.000", "2023/07/11 06:04:31.000"]))
+    packed = tmp_path / f"{plain.name}{suffix}"
+    packed.write_bytes(pack(plain.read_bytes()))
+    assert read_drive(packed).table.equals(read_drive(plain).table)
+    packed.write_bytes(pack(b"% program   : RTKLIB\n1 2 3\n"))
+    with pytest.raises(InputError, match="holds no epoch") as caught:
+        read_drive(packed)
+    assert str(packed) in str(caught.value)
+
+
+def test_a_packed_log_is_told_by_what_is_in_it(shared_data, tmp_path):
+    plain = shared_data / "trajectory" / "nagoya" / "reference_1Hz.pos"
+    packed = tmp_path / "drive"
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    assert kind_of(packed) == "drives"
+    assert read_drive(packed).table.num_rows == read_drive(plain).table.num_rows
 
 
 @pytest.mark.parametrize("seed", range(30))

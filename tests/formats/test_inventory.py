@@ -640,3 +640,37 @@ def test_a_table_whose_positions_cannot_be_read_is_refused(tmp_path):
     path.write_text('id,lon,lat,code\n1,"8 east","49 north",DE:205\n', encoding="utf-8")
     with pytest.raises(InputError, match="none of 1 rows has a position that can be used"):
         read_signs(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "cell"),
+    [
+        ("location", '"60.17, 24.94"'),
+        ("coordinates", '"(60.17,24.94)"'),
+        ("GPS", "60.17 24.94"),
+        ("lon_lat", '"24.94, 60.17"'),
+        ("latlng", '"60,17; 24,94"'),
+    ],
+)
+def test_both_coordinates_in_one_column(write, name, cell):
+    layer = read_signs(write(f"code,{name}\nFI:B6,{cell}\nFI:B5,somewhere\n", "signs.csv"))
+    assert lonlat(layer.table) == ([24.94], [60.17])
+    assert layer.skipped == {"coordinates that are no number": 1}
+
+
+def test_a_street_beside_coordinates_is_no_place(write):
+    layer = read_signs(write("code,location,lon,lat\nFI:B6,Mannerheimintie 1,24.94,60.17\n", "signs.csv"))
+    assert lonlat(layer.table) == ([24.94], [60.17])
+
+
+def test_esri_json(write):
+    sets = {
+        "geometryType": "esriGeometryPoint",
+        "spatialReference": {"wkid": 3067},
+        "fields": [{"name": "merkkikoodi", "type": "esriFieldTypeString", "length": 9}],
+        "features": [{"attributes": {"merkkikoodi": "FI:B6"}, "geometry": {"x": 385000.0, "y": 6672000.0}}],
+    }
+    layer = read_signs(write(json.dumps(sets), "signs.json"))
+    assert column(layer, "concept") == ["stop"]
+    (lon,), (lat,) = lonlat(layer.table)
+    assert Transformer.from_crs(4326, 3067, always_xy=True).transform(lon, lat) == pytest.approx((385000.0, 6672000.0))

@@ -156,6 +156,8 @@ def test_a_table_without_geometry_has_no_place(tmp_path):
         ("absent.xodr", None, "no such file"),
         ("empty.pos", b"", "empty"),
         ("picture.png", b"\x89PNG\r\n\x1a\n\0", "not known"),
+        ("signs.kml", b"<?xml version='1.0'?><kml><Document/></kml>", "KML, which is not read; `ogr2ogr"),
+        ("log.csv", b"Sign list,,\n\nlat,lon,code\n60,24,FI:B6\n", "what stands before the header"),
     ],
 )
 def test_what_cannot_be_read_is_told(name, content, told, tmp_path):
