@@ -13,7 +13,7 @@ from geofleet.algorithms.joint_alignment import align_passes
 from geofleet.algorithms.joint_association import NO_SIGN, REACH_M, Places, leaders, sweep
 from geofleet.algorithms.joint_merging import merge
 from geofleet.algorithms.joint_solution import solve
-from geofleet.algorithms.joint_tracks import Passes, Tracks, pass_biases, places, with_jitter
+from geofleet.algorithms.joint_tracks import Passes, Tracks, blocks, pass_biases, places, with_jitter
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,8 +43,6 @@ PRIOR_IS_OFF = 1 / 3
 """Probability beforehand that it is off."""
 LEFT_OUT = 0.1
 """What a 90 % ellipse leaves out: up to so much the other translation need not lie in it."""
-BLOCK = 65_536
-"""Tracks that are looked at together: matrices of all would be large."""
 AS_READ = 1e-6
 """Share of misread tracks where nothing can show one."""
 PRIOR_RETYPED = 0.1
@@ -168,11 +166,15 @@ class Search:
 
     def placed(self, tracks: Tracks) -> tuple[Floats, Floats]:
         """Return where tracks are, offset and bias of their pass taken out as its other tracks know them."""
-        inverse = np.linalg.inv(tracks.matrix[:, :2, :2])
-        slope = inverse @ tracks.matrix[:, :2, 2:]
-        known = np.concatenate((np.broadcast_to(np.eye(2), slope.shape), slope), axis=2)
-        xy_m = tracks.origin_xy_m + np.einsum("tij,tj->ti", inverse, tracks.vector[:, :2])
-        return xy_m - np.einsum("tij,tj->ti", known, self.at), inverse + known @ self.at_cov @ np.swapaxes(known, 1, 2)
+        xy_m, cov = np.empty((len(self.sign), 2)), np.empty((len(self.sign), 2, 2))
+        for rows in blocks(len(self.sign)):
+            inverse = np.linalg.inv(tracks.matrix[rows, :2, :2])
+            slope = inverse @ tracks.matrix[rows, :2, 2:]
+            known = np.concatenate((np.broadcast_to(np.eye(2), slope.shape), slope), axis=2)
+            there = tracks.origin_xy_m[rows] + np.einsum("tij,tj->ti", inverse, tracks.vector[rows, :2])
+            xy_m[rows] = there - np.einsum("tij,tj->ti", known, self.at[rows])
+            cov[rows] = inverse + known @ self.at_cov[rows] @ np.swapaxes(known, 1, 2)
+        return xy_m, cov
 
     def places(self, loose_m: float = 0.0) -> Places:
         """Return the tracks as the sweeps see them."""
@@ -218,7 +220,7 @@ class Search:
         own, right = np.zeros((len(sigma), 4, 4)), np.zeros((len(sigma), 4))
         np.add.at(own, code, tracks.matrix)
         np.add.at(right, code, said)
-        for rows in np.array_split(np.arange(len(code)), 1 + len(code) // BLOCK):
+        for rows in blocks(len(code)):
             root = sigma[code[rows]][:, :, None] * np.eye(4)
             inner = np.eye(4) + root @ (own[code[rows]] - tracks.matrix[rows]) @ root
             self.at_cov[rows] = root @ np.linalg.solve(inner, root)

@@ -38,6 +38,8 @@ SPOILT_RATIO = 4.0
 FRAGMENT_CHI2 = 13.8
 """Fragments of one pass whose places differ by less (99.9 %, 2 degrees of freedom) are one track."""
 FRAGMENT_REACH_M = 15.0
+BLOCK = 65_536
+"""Tracks that are looked at together."""
 UNKNOWNS = 4
 """That a track solves for: two measurements a frame, less these, are its degrees of freedom."""
 
@@ -164,13 +166,19 @@ def with_jitter(tracks: Tracks, jitter_m: Floats) -> Tracks:
 
     N' = N - N_:p (τ⁻²I + N_pp)⁻¹ N_p:, and r' alike: no track is trusted beyond what its model can promise.
     """
-    gain = np.linalg.solve(
-        jitter_m[:, None, None] ** 2 * tracks.matrix[:, :2, :2] + np.eye(2),
-        jitter_m[:, None, None] ** 2 * np.concatenate((tracks.matrix[:, :2], tracks.vector[:, :2, None]), axis=2),
-    )
-    matrix = tracks.matrix - tracks.matrix[:, :, :2] @ gain[:, :, :4]
-    vector = tracks.vector - np.einsum("tij,tj->ti", tracks.matrix[:, :, :2], gain[:, :, 4])
-    return replace(tracks, matrix=(matrix + np.swapaxes(matrix, 1, 2)) / 2, vector=vector)
+    matrix, vector = np.empty_like(tracks.matrix), np.empty_like(tracks.vector)
+    for rows in blocks(len(vector)):
+        n_p, r, var = tracks.matrix[rows, :2], tracks.vector[rows], jitter_m[rows, None, None] ** 2
+        gain = np.linalg.solve(var * n_p[:, :, :2] + np.eye(2), var * np.concatenate((n_p, r[:, :2, None]), axis=2))
+        less = tracks.matrix[rows] - tracks.matrix[rows, :, :2] @ gain[:, :, :4]
+        matrix[rows] = (less + np.swapaxes(less, 1, 2)) / 2
+        vector[rows] = r - np.einsum("tij,tj->ti", tracks.matrix[rows, :, :2], gain[:, :, 4])
+    return replace(tracks, matrix=matrix, vector=vector)
+
+
+def blocks(n: int) -> list[slice]:
+    """Return the parts in which so many tracks are looked at: matrices of all of them together would be large."""
+    return [slice(begin, begin + BLOCK) for begin in range(0, n, BLOCK)]
 
 
 def pass_biases(tracks: Tracks, passes: Passes) -> tuple[Floats, Floats]:
@@ -179,10 +187,11 @@ def pass_biases(tracks: Tracks, passes: Passes) -> tuple[Floats, Floats]:
     A bias that the sensor cannot have stays 0.
     """
     n_passes = len(passes.gnss_sigma_m)
-    matrix, vector = about_bias(tracks.matrix, tracks.vector)
     schur, right = np.zeros((n_passes, 2, 2)), np.zeros((n_passes, 2))
-    np.add.at(schur, tracks.pass_code, matrix)
-    np.add.at(right, tracks.pass_code, vector)
+    for rows in blocks(len(tracks.pass_code)):
+        matrix, vector = about_bias(tracks.matrix[rows], tracks.vector[rows])
+        np.add.at(schur, tracks.pass_code[rows], matrix)
+        np.add.at(right, tracks.pass_code[rows], vector)
     return bias_posterior(schur, right, passes.bias_sigma)
 
 

@@ -156,7 +156,8 @@ def _lists(table: pa.Table, name: str, length: int) -> Floats:
 def _frames(table: pa.Table, name: str) -> Ints:
     if name not in table.column_names:
         return np.full(table.num_rows, UNKNOWN_FRAME)
-    return np.asarray(pc.fill_null(table[name].cast(pa.int64()), UNKNOWN_FRAME).to_numpy(), np.int64)
+    # a copy, for Arrow's own memory is read-only: to numba that is another type, and all of the search compiles again
+    return np.array(pc.fill_null(table[name].cast(pa.int64()), UNKNOWN_FRAME).to_numpy(), np.int64)
 
 
 def _views(passes: pa.Table, code: dict[str, int], frame: EnuFrame) -> Views:
