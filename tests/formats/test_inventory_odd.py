@@ -148,7 +148,6 @@ def test_codes_that_are_numbers_stay_as_written():
     ("text", "encoding", "message"),
     [
         ('[{"code": "206", "lat": 52.5, "lon": 13.4}]', "utf-8", "JSON, but no GeoJSON"),
-        ('{"geometryType": "esriGeometryPoint", "features": []}', "utf-8", "JSON, but no GeoJSON"),
         (collection({"code": "206"}), "utf-16", "in UTF-16"),
         (collection({}), "utf-8", "geometries without any attribute"),
         (json.dumps({"type": "Point", "coordinates": [LON, LAT]}), "utf-8", "geometries without any attribute"),
