@@ -27,9 +27,7 @@ track is of which sign; it pays for nothing else, so what separates it from the 
 a fleet has in common. *DBSCAN corrected* is DBSCAN after `--correct-bias`, on the same detections and passes.
 
 The number of replicates stands beside every figure; few of them settle no 1st percentile. A prior map holds the signs
-that at least half of the passes of the largest fleet report, less what is outdated. Fleets in
-the table of what the common offset costs were measured with fusion as `docs/fusion.md` states it; all other rows before
-moved entries, brief views and the odds of a shifted prior were as there.
+that at least half of the passes of the largest fleet report, less what is outdated.
 """
 
 PAIRED = """### Joint and corrected DBSCAN on the same runs
