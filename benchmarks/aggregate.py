@@ -145,28 +145,43 @@ def _peer(path: Path, work: Path, cluster: Callable[[NDArray[np.float64]], NDArr
 
 
 def postgis(path: Path, work: Path) -> dict[str, Any]:
+    import duckdb
     import pyarrow as pa
-    import pyarrow.csv as pacsv
 
-    xy, codes = load(path)
-    points = pa.table({"id": np.arange(len(xy)), "class": codes, "x": xy[:, 0], "y": xy[:, 1]})
-    pacsv.write_csv(points, work / "points.csv", pacsv.WriteOptions(include_header=False))
     with Server(work) as server:
-        server.sql("CREATE EXTENSION postgis; CREATE UNLOGGED TABLE points (id bigint, class int, x float8, y float8)")
+        server.sql(
+            "CREATE EXTENSION postgis; CREATE UNLOGGED TABLE points (id bigint, class int, x float8, y float8, "
+            "lon float8, lat float8, pass_id text, confidence float8, t_first timestamptz, t_last timestamptz)"
+        )
         begin = time.perf_counter()
+        xy, codes = load(path)
+        connection = duckdb.connect(config={"threads": 2})
+        connection.register("plane", pa.table({"class": codes, "x": xy[:, 0], "y": xy[:, 1]}))
+        connection.execute(
+            "COPY (SELECT row_number() OVER () AS id, class, x, y, bbox.xmin, bbox.ymin, pass_id, class_confidence, "
+            "t_first, t_last FROM read_parquet($path) POSITIONAL JOIN plane) TO $out (FORMAT csv, HEADER false)",
+            {"path": str(path), "out": str(work / "points.csv")},
+        )
         server.sql(rf"\copy points FROM '{work / 'points.csv'}' (FORMAT csv)")
         loaded = time.perf_counter()
         server.sql(
-            "SET work_mem = '2GB'; CREATE UNLOGGED TABLE labels AS SELECT id, class, "
+            "SET work_mem = '2GB'; CREATE UNLOGGED TABLE labels AS SELECT *, "
             f"ST_ClusterDBSCAN(ST_MakePoint(x, y), {EPS_M}, {MIN_SAMPLES}) OVER (PARTITION BY class) AS label "
             "FROM points"
         )
         done = time.perf_counter()
         server.sql(
+            "SET work_mem = '2GB'; CREATE UNLOGGED TABLE fused AS SELECT class, label, avg(lon) AS lon, "
+            "avg(lat) AS lat, count(*) AS n_detections, count(DISTINCT pass_id) AS n_passes, "
+            "avg(confidence) AS class_confidence, min(t_first) AS first_seen, max(t_last) AS last_seen FROM labels "
+            "WHERE label IS NOT NULL GROUP BY class, label HAVING count(DISTINCT pass_id) >= 3"
+        )
+        whole = time.perf_counter() - begin
+        server.sql(
             rf"\copy (SELECT coalesce(label * 1000 + class, -1) FROM labels ORDER BY id) TO '{work / 'labels.csv'}'"
         )
     np.save(work / "labels.npy", np.loadtxt(work / "labels.csv", np.int64))
-    return {"cluster_s": done - loaded, "whole_s": done - begin}
+    return {"cluster_s": done - loaded, "whole_s": whole}
 
 
 class Server:
