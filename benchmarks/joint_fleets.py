@@ -175,7 +175,9 @@ def _regular(signs: pa.Table, drive: pa.Table) -> pa.Table:
     few, many = classes.index("no_entry"), classes.index("yield")
     rows = signs.take(pa.array([few if number % EVERY_TH == 0 else many for number in range(len(at))]))
     columns = {name: rows[name] for name in rows.column_names if name not in (GEOMETRY, BBOX)}
-    made = {"sign_id": [f"made{number:04}" for number in range(len(at))], "source": "made up: signs at regular spacing"}
+    names = [f"made{number:04}" for number in range(len(at))]
+    # a support each: equal classes on one support count once
+    made = {"sign_id": names, "support_id": names, "source": "made up: signs at regular spacing"}
     return build_table(SIGNS, columns | made, geometry=frame.to_lonlat(place))
 
 

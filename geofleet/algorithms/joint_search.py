@@ -43,6 +43,8 @@ PRIOR_IS_OFF = 1 / 3
 """Probability beforehand that it is off."""
 LEFT_OUT = 0.1
 """What a 90 % ellipse leaves out: up to so much the other translation need not lie in it."""
+BEYOND_CHI2 = 13.8
+"""Squared standard deviations, of two unknowns, that one pass in a thousand exceeds by chance."""
 AS_READ = 1e-6
 """Share of misread tracks where nothing can show one."""
 PRIOR_RETYPED = 0.1
@@ -90,6 +92,7 @@ class Search:
 
     def __init__(self, tracks: Tracks, passes: Passes, n_classes: int, n_fleet: int) -> None:
         self.tracks, self.passes, self.n_fleet = tracks, passes, n_fleet
+        self.declared = passes
         self.n_classes = n_classes
         n_passes, n_kinds = len(passes.gnss_sigma_m), int(passes.kind_code.max(initial=-1)) + 1
         self.has_prior = n_passes > n_fleet
@@ -240,7 +243,20 @@ class Search:
         )
         self.jitter = self._learn_jitter()
         self.weighted = with_jitter(self.tracks, self.jitter[self.tracks.pass_code])
+        self.passes = self._believed()
         self._look_at_passes()
+
+    def _believed(self) -> Passes:
+        """Return the passes as they declare themselves, those with a gross fault aside (`believed`).
+
+        A prior map that is off must not make a fault of what a sure pass sees: it is judged with the map let go.
+        """
+        nuisance = self.nuisance
+        if self.has_prior:
+            loose = replace(self.passes, gnss_sigma_m=np.append(self.passes.gnss_sigma_m[:-1], PRIOR_SHIFT_M[1]))
+            n_signs = int(self.sign.max()) + 1
+            nuisance = solve(self.weighted, loose, self.sign, n_signs, nuisance, with_cov=False).nuisance
+        return believed(self.declared, nuisance, self.n_fleet)
 
     def _learn_jitter(self) -> Floats:
         """Return the likeliest further error of places, an axis: the fleet's, or its own for a pass that differs."""
@@ -305,6 +321,24 @@ class Search:
         """Solve with this standard deviation of the translation of the prior map."""
         passes = replace(self.passes, gnss_sigma_m=np.append(self.passes.gnss_sigma_m[:-1], sigma_m))
         return solve(self.weighted, passes, self.sign, n_signs, self.nuisance, with_cov=True, marginal_of=self.n_fleet)
+
+
+def believed(declared: Passes, nuisance: Floats, n_fleet: int) -> Passes:
+    """Return the passes with the sigmas of those widened that are further off than they can be by what they declare.
+
+    Offset and biases apart: where χ² of the two is beyond `BEYOND_CHI2`, both variances are taken χ²/2 times as large,
+    the likeliest factor: a fault that is held to what its pass declares draws the signs of all others along.
+    """
+    sigma = np.column_stack((declared.gnss_sigma_m, declared.gnss_sigma_m, declared.bias_sigma))
+    squared = (nuisance / np.where(sigma > 0, sigma, np.inf)) ** 2
+    chi2 = squared.reshape(-1, 2, 2).sum(axis=2)
+    scale = np.sqrt(np.where(chi2 > BEYOND_CHI2, chi2 / 2, 1.0))
+    scale[n_fleet:] = 1.0
+    return replace(
+        declared,
+        gnss_sigma_m=declared.gnss_sigma_m * scale[:, 0],
+        bias_sigma=declared.bias_sigma * scale[:, 1:],
+    )
 
 
 def _passes_around(xy_m: Floats, pass_code: Ints) -> Ints:

@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 from geofleet.algorithms.fusion import ID_SHIFT, POSITION_DIGITS, hash_members
 from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.algorithms.joint import fuse_joint
-from geofleet.algorithms.joint_search import PriorMap
+from geofleet.algorithms.joint_search import BEYOND_CHI2, PriorMap
 from geofleet.algorithms.joint_tracks import places
 from geofleet.engines.whole import MAX_EXTENT_M
 from geofleet.errors import InputError
@@ -37,9 +37,10 @@ if TYPE_CHECKING:
 
 IN_MAP = 0.5
 """A sign is in the map when its existence times its class confidence is above this: each is likelier in than out."""
-SUSPECT_CHI2 = 13.8
-"""Squared standard deviations, of two unknowns, that one pass in a thousand exceeds by chance."""
 SUSPECT_NOISE = 2.0
+ALONE_LEAST, ALONE_CHANCES = 4, 3
+"""So many detections, and most of its own, of signs that others had in view, so many passes in all, and do not report:
+such a pass is not where it says."""
 TOLD_PASSES = 5
 """So many suspect passes are named in a note; the table has all."""
 PRIOR_OFF_M = 0.3
@@ -224,13 +225,18 @@ def _nuisance(task: JointTask, fleet: Fleet, found: JointMap) -> pa.Table:
     noise = np.append(found.noise_factor[:n_fleet], np.ones(extra))[rows]
     kinds = [fleet.kinds[code] for code in fleet.passes.kind_code.tolist()] + [PRIOR_NAME] * extra
     names = [*fleet.pass_ids, *[PRIOR_NAME] * extra]
+    is_alone = ((found.n_passes == 1) & (found.n_chances >= ALONE_CHANCES))[found.sign_of_track]
+    alone = np.bincount(fleet.tracks.pass_code[is_alone], minlength=n_fleet)
+    n_tracks, n_alone = (np.append(n, np.zeros(extra, np.int64))[rows] for n in (count, alone))
+    is_lost = (n_alone >= ALONE_LEAST) & (2 * n_alone > n_tracks)
     return build_table(
         NUISANCE,
         {
             "run_id": task.run_id,
             "pass_id": [names[row] for row in rows.tolist()],
             "sensor_kind": [kinds[row] for row in rows.tolist()],
-            "n_detections": np.append(count, np.zeros(extra, np.int64))[rows],
+            "n_detections": n_tracks,
+            "n_alone": n_alone,
             "offset_e_m": nuisance[:, 0],
             "offset_n_m": nuisance[:, 1],
             "range_bias_m": nuisance[:, 2],
@@ -239,7 +245,7 @@ def _nuisance(task: JointTask, fleet: Fleet, found: JointMap) -> pa.Table:
             "bias_chi2": bias_chi2,
             "noise_factor": noise,
             "jitter_m": found.jitter_m[rows],
-            "is_suspect": (np.maximum(offset_chi2, bias_chi2) > SUSPECT_CHI2) | (noise > SUSPECT_NOISE),
+            "is_suspect": (np.maximum(offset_chi2, bias_chi2) > BEYOND_CHI2) | (noise > SUSPECT_NOISE) | is_lost,
         },
     )
 
@@ -278,14 +284,15 @@ def _warnings(task: JointTask, nuisance: pa.Table) -> tuple[str, ...]:
         told = "; ".join(
             f"{row['pass_id']} (offset {row['offset_e_m']:+.1f} m east {row['offset_n_m']:+.1f} m north, range "
             f"{row['range_bias_m']:+.1f} m, bearing {row['bearing_bias_deg']:+.1f}°, "
-            f"noise {row['noise_factor'] ** 0.5:.1f} times)"
+            f"noise {row['noise_factor'] ** 0.5:.1f} times, alone with {row['n_alone']} of {row['n_detections']} signs)"
             for row in worst
         )
         more = f"; and {len(suspect) - len(worst)} more" if len(suspect) > len(worst) else ""
         warnings.append(
             f"{task.run_id}: {len(suspect)} of {nuisance.num_rows - (task.prior is not None)} passes are far from what "
             f"they declare: {told}{more}. What the tracks of a pass "
-            "have in common is taken out, and noise lowers its weight; look at the sensor, or at its declaration."
+            "have in common is taken out and, beyond what it declares, draws no other pass along; noise lowers its "
+            "weight. Look at the sensor, or at its declaration."
         )
     warnings += [
         f"{task.run_id}: the prior map lies {row['offset_e_m']:+.2f} m east, {row['offset_n_m']:+.2f} m north of where "

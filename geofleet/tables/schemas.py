@@ -290,6 +290,7 @@ NUISANCE = Schema(
         _c("pass_id", TEXT, "the pass; prior map for the translation of a prior map"),
         _c("sensor_kind", TEXT, "kind of its sensor"),
         _c("n_detections", INT, "detections of the pass"),
+        _c("n_alone", INT, "of these, of signs that no other pass reports although three or more had them in view"),
         _c("offset_e_m", FLOAT, "offset of the reported path, east"),
         _c("offset_n_m", FLOAT, "the same, north"),
         _c("range_bias_m", FLOAT, "what the sensor adds to every range"),
@@ -298,7 +299,11 @@ NUISANCE = Schema(
         _c("bias_chi2", FLOAT, "biases squared in declared standard deviations, two degrees of freedom"),
         _c("noise_factor", FLOAT, "factor on the declared variance of its frames, from its own residuals"),
         _c("jitter_m", FLOAT, "further error of its places an axis, from how they fit the other passes"),
-        _c("is_suspect", FLAG, "far from what it declares: a chi2 above 13.8 (1 in 1,000), or noise_factor above 2"),
+        _c(
+            "is_suspect",
+            FLAG,
+            "far from what it declares: a chi2 above 13.8 (1 in 1,000), noise_factor above 2, or mostly alone",
+        ),
     ),
 )
 

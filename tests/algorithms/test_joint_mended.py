@@ -15,7 +15,7 @@ from geofleet.algorithms.joint_alignment import align_passes
 from geofleet.algorithms.joint_association import Places, sweep
 from geofleet.algorithms.joint_evidence import recognition
 from geofleet.algorithms.joint_merging import merge
-from geofleet.algorithms.joint_search import PriorMap
+from geofleet.algorithms.joint_search import PriorMap, believed
 from geofleet.algorithms.joint_solution import solve
 from geofleet.algorithms.joint_tracks import Passes, Tracks, tracks_of_means
 
@@ -222,3 +222,47 @@ def test_what_passes_say_of_a_sign_adds_up(n_first: int, seed: int) -> None:
     whole, first, rest = said(np.arange(5)), said(np.arange(n_first)), said(np.arange(n_first, 5))
     np.testing.assert_allclose(first[0] + rest[0], whole[0], rtol=1e-8)
     np.testing.assert_allclose(first[1] + rest[1], whole[1], rtol=1e-7, atol=1e-9)
+
+
+def moved(tracks: Tracks, pass_code: int, east_m: float) -> Tracks:
+    xy_m = tracks.origin_xy_m.copy()
+    xy_m[tracks.pass_code == pass_code, 0] += east_m
+    return replace(tracks, origin_xy_m=xy_m)
+
+
+def reported(found: JointMap) -> Floats:
+    """Return the places of the signs that passes agree on, along the street."""
+    there = found.xy_m[found.n_passes > 1]
+    return there[np.argsort(there[:, 0])]
+
+
+def test_a_car_with_a_gross_offset_draws_no_other_along() -> None:
+    """8 m off where 1.5 m are declared: believed as declared it would draw the map along by a sixth of it."""
+    signs, _, tracks = street()
+    found = fused(moved(tracks, 2, 8.0), 6)
+    others = fused(tracks.take(tracks.pass_code != 2), 6)
+    assert found.nuisance[2, 0] > 6
+    assert np.abs(reported(found) - reported(others)).max() < 0.25
+    assert np.abs(reported(found) - signs).max() < 0.5
+
+
+def test_a_sound_car_is_believed_as_it_declares() -> None:
+    passes = Passes(np.array([1.5, 1.5]), np.array([[2.0, 0.05], [2.0, 0.05]]), np.zeros(2, np.int64))
+    nuisance = np.array([[3.0, -3.0, 5.0, 0.1], [6.0, 6.0, 5.0, 0.2]])  # χ² 8 and 10.3; 32 and 22.3
+    found = believed(passes, nuisance, 2)
+    np.testing.assert_allclose(found.gnss_sigma_m, [1.5, 1.5 * 4])
+    np.testing.assert_allclose(found.bias_sigma, [[2.0, 0.05], np.array([2.0, 0.05]) * np.sqrt(22.25 / 2)])
+
+
+def test_a_prior_map_that_is_off_makes_no_fault_of_what_an_rtk_car_sees() -> None:
+    """The map declares 0.15 m and lies off by 1.5 m; one car of six knows its place to 0.05 m."""
+    signs, classes, tracks = street()
+    own = tracks.pass_code == 0
+    xy_m = tracks.origin_xy_m.copy()
+    sign = np.argmin(np.hypot(*(xy_m[own, None] - signs[None]).transpose(2, 0, 1)), axis=1)
+    xy_m[own] = signs[sign]
+    passes = Passes(np.append(0.05, np.full(5, 1.5)), np.zeros((6, 2)), np.zeros(6, np.int64))
+    off = PriorMap(signs + np.array([0.9, 1.2]), np.full(len(signs), 0.15), classes, np.zeros_like(signs))
+    found = fuse_joint(replace(tracks, origin_xy_m=xy_m), passes, n_classes=N_CLASSES, prior=off)
+    assert np.hypot(*found.nuisance[0, :2]) < 0.05
+    assert np.abs(reported(found) - signs).max() < 0.2

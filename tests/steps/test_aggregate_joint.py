@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
@@ -19,7 +20,7 @@ from geofleet.steps.ingest_detections import ingest_detections
 from geofleet.steps.simulate import simulate
 from geofleet.tables.manifest import manifest_path
 from geofleet.tables.schemas import DETECTIONS, EVIDENCE, NUISANCE, PASSES, REFERENCE, SIGNS
-from geofleet.tables.store import read_table, write_table
+from geofleet.tables.store import build_table, lonlat, read_table, write_table
 from geofleet.workflows.stale import stale
 
 RAW = Path(__file__).parents[2] / "data" / "raw"
@@ -112,6 +113,32 @@ def test_a_car_with_a_gross_fault_is_told_and_spoils_nothing(fleet, tmp_path):
     totals = evaluate(out, tmp_path / "faulty/reference.parquet", tmp_path / "evaluation", config=config).totals
     assert totals[0]["f1"] > 0.98
     assert totals[0]["gospa_m"] < 1.0
+
+
+@pytest.mark.parametrize("north_deg", [7e-5, 25e-5])  # 7.8 m, where 1.3 m are declared; and 28 m: it finds no other
+def test_a_car_that_is_not_where_it_says_is_told_and_draws_no_other_along(fleet, tmp_path, north_deg):
+    whole = read_table(DETECTIONS, fleet / "detections")
+    pass_id = pc.min(whole["pass_id"]).as_py()
+    is_off = pc.equal(whole["pass_id"], pass_id)
+    lon, lat = lonlat(whole)
+    columns = {name: whole[name] for name in whole.column_names if name not in {"geometry", "bbox"}}
+    columns["info_lat"] = pc.add(columns["info_lat"], pc.if_else(is_off, north_deg, 0.0))
+    place = (lon, lat + north_deg * is_off.to_numpy())
+    tables = {
+        "off": build_table(DETECTIONS, columns, geometry=place),
+        "without": whole.filter(pc.invert(is_off)),
+    }
+    totals, rows = {}, {}
+    for name, table in tables.items():
+        write_table(DETECTIONS, table, tmp_path / f"{name}.parquet")
+        out = tmp_path / f"{name}_map.parquet"
+        aggregate(tmp_path / f"{name}.parquet", out, config=JOINT, passes=fleet / "passes.parquet")
+        rows[name] = read_table(NUISANCE, beside(out, "nuisance")).to_pylist()
+        totals[name] = evaluate(out, fleet / "reference.parquet", tmp_path / name, config=JOINT).totals
+    assert [row["pass_id"] for row in rows["off"] if row["is_suspect"]] == [pass_id] * 2  # of two runs
+    for with_it, without in zip(totals["off"], totals["without"], strict=True):
+        assert with_it["f1"] >= without["f1"] - 0.02
+        assert with_it["gospa_m"] < without["gospa_m"] + 0.25
 
 
 def test_a_prior_map_that_is_shifted_is_told(fleet, tmp_path):

@@ -85,7 +85,7 @@ def fuse_jointly(
         n_detections=staged.judged.n_detections,
         n_rejected=staged.judged.rejected.num_rows,
         n_used=sum(task.tracks.num_rows for task in tasks),
-        n_tiles=0,
+        n_tiles=None,
         n_clusters=sum(one.n_candidates for one in found),
         n_signs=n_signs,
         notes=few(staged.judged.fleet, n_vehicles) + tuple(note for one in found for note in one.notes),

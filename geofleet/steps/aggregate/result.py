@@ -27,7 +27,8 @@ class AggregateResult:
     """What became of the detections.
 
     `n_detections` and `n_rejected` count the whole table, `n_used` the vehicles asked for; signs are clusters with
-    enough passes. `n_suspect_passes`, of joint fusion only, are those far from what they declare.
+    enough passes. `n_tiles` is None where runs are estimated whole. `n_suspect_passes`, of joint fusion only, are those
+    far from what they declare.
     """
 
     out: Path
@@ -37,7 +38,7 @@ class AggregateResult:
     n_detections: int
     n_rejected: int
     n_used: int
-    n_tiles: int
+    n_tiles: int | None
     n_clusters: int
     n_signs: int
     notes: tuple[str, ...] = ()
@@ -45,10 +46,11 @@ class AggregateResult:
 
     def summary(self) -> list[str]:
         """Return the result in sentences."""
+        where = "each run as a whole" if self.n_tiles is None else f"in {self.n_tiles or 'no'} tiles"
         lines = [
             (
                 f"{self.n_signs} signs from {self.n_used} of {self.n_detections} detections of {self.n_vehicles} "
-                f"vehicles in {len(self.run_ids)} run(s): {self.n_clusters} clusters in {self.n_tiles or 'no'} tiles, "
+                f"vehicles in {len(self.run_ids)} run(s): {self.n_clusters} clusters {where}, "
                 f"{self.n_clusters - self.n_signs} with too little support."
             ),
             *self.notes,
