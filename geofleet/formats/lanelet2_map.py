@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geofleet.errors import ConfigError, InputError
+from geofleet.errors import InputError
 from geofleet.formats.datum import datum_of
+from geofleet.formats.lanelet2_places import Projection, placed_by_squares
 from geofleet.formats.reading import WGS84, open_unpacked, read_head
 from geofleet.formats.xml import explained, iter_elements
 
@@ -36,11 +37,12 @@ _KEY, _VALUE = rb"""k\s*=\s*["']type["']""", rb"""v\s*=\s*["']""" + _TYPES + rb"
 _MARK = re.compile(_KEY + rb"\s+" + _VALUE + rb"|" + _VALUE + rb"\s+" + _KEY)
 _CHUNK_BYTES, _OVERLAP_BYTES = 1 << 20, 256
 _MISFIT_M = 1.0
-_MAX_LON_DEG, _MAX_LAT_DEG, _MAX_UTM_LAT_DEG = 180.0, 90.0, 84.0
+_MAX_LON_DEG, _MAX_LAT_DEG = 180.0, 90.0
 _NUMBERS = ("local_x", "local_y", "ele")
 
 MISSING_NODES = "nodes that ways refer to and the file does not hold"
 BAD_POSITION = "nodes without a valid position"
+BY_SQUARE = "nodes placed by mgrs_code, local_x and local_y"
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +139,8 @@ def load_map(
         Latitude and longitude, degrees, that `local_x` and `local_y` count from, as Lanelet2's UtmProjector does:
         easting and northing in the UTM zone of the origin, minus those of the origin.
     utm
-        Projected CRS, easting and northing of `local_x` = `local_y` = 0. With neither, `lat` and `lon` are used.
+        Projected CRS, easting and northing of `local_x` = `local_y` = 0. With neither, `lat` and `lon` are used or,
+        where a node has none, `local_x`, `local_y` in the MGRS square of `mgrs_code`.
 
     Raises
     ------
@@ -148,7 +151,7 @@ def load_map(
         `origin` and `utm` are both given, or one of them makes no sense.
     """
     raw = _RawMap()
-    projection = _Projection.of(origin, utm)
+    projection = Projection.of(origin, utm)
     for element in iter_elements(path, ("node", "way", "relation"), root="osm"):
         raw.add(element)
     if not (
@@ -169,6 +172,7 @@ class _RawMap:
     def __init__(self) -> None:
         self.row: dict[str, int] = {}
         self.numbers: list[tuple[float, ...]] = []  # lon, lat, local_x, local_y, ele
+        self.codes: list[str] = []  # mgrs_code
         self.sign_nodes: dict[str, dict[str, str]] = {}
         self.ways: dict[str, tuple[list[str], dict[str, str]]] = {}
         self.lanelets: dict[str, Relation] = {}
@@ -202,6 +206,7 @@ class _RawMap:
         self.row[identity] = len(self.numbers)
         place = (_float(element.get("lon")), _float(element.get("lat")))
         self.numbers.append((*place, *(_float(tags.get(name)) for name in _NUMBERS)))
+        self.codes.append(tags.get("mgrs_code", ""))
         if tags.get("type") == SIGN:
             self.sign_nodes[identity] = tags
 
@@ -218,10 +223,10 @@ class _RawMap:
             tags, tuple(Member(m.get("type", ""), m.get("ref", "").strip(), m.get("role", "")) for m in members)
         )
 
-    def finish(self, projection: _Projection | None) -> LaneletMap:
+    def finish(self, projection: Projection | None) -> LaneletMap:
         """Return the map, its points in degrees."""
         numbers = np.array(self.numbers, np.float64).reshape(-1, 5)
-        lon, lat = self._positions(numbers, projection)
+        lon, lat, datum = self._positions(numbers, projection)
         with np.errstate(invalid="ignore"):
             valid = (np.abs(lon) <= _MAX_LON_DEG) & (np.abs(lat) <= _MAX_LAT_DEG)
         if len(valid) and not valid.any():
@@ -256,15 +261,16 @@ class _RawMap:
             self.regulations,
             dict(self.skipped),
             {reason: count for reason, count in self.found.items() if count},
-            datum_of(projection.crs, lon[valid], lat[valid]) if projection else WGS84,
+            datum_of(projection.crs, lon[valid], lat[valid]) if projection else datum,
         )
 
-    def _positions(self, numbers: Floats, projection: _Projection | None) -> tuple[Floats, Floats]:
-        """Return longitude and latitude of all nodes, NaN where there is none."""
+    def _positions(self, numbers: Floats, projection: Projection | None) -> tuple[Floats, Floats, Datum]:
+        """Return longitude and latitude of all nodes, NaN where there is none, and what they were in."""
         lon, lat, x_m, y_m = numbers[:, :4].T
         if projection is None:
-            _refuse_placeholders(lon, lat, x_m)
-            return lon, lat
+            placed = placed_by_squares(lon, lat, x_m, y_m, self.codes)
+            self.found[BY_SQUARE] += placed.n_by_square
+            return placed.lon, placed.lat, placed.datum
         if np.isnan(x_m).all():
             raise InputError("no node has local_x and local_y.", todo="Leave --origin and --utm away.")
         local_lon, local_lat = projection.to_lonlat(x_m, y_m)
@@ -273,65 +279,7 @@ class _RawMap:
             self.found["nodes whose lat/lon lie over 1 m from where local_x/local_y put them"] = int(
                 (misfit > _MISFIT_M).sum()
             )
-        return local_lon, local_lat
-
-
-@dataclass(frozen=True, slots=True)
-class _Projection:
-    """Where local coordinates lie: a projected CRS, easting and northing of their zero."""
-
-    crs: str
-    easting_m: float
-    northing_m: float
-
-    @classmethod
-    def of(cls, origin: tuple[float, float] | None, utm: tuple[str, float, float] | None) -> _Projection | None:
-        """Check what the caller gave."""
-        from pyproj import CRS, Transformer  # noqa: PLC0415  (only maps in local coordinates need PROJ)
-        from pyproj.exceptions import CRSError  # noqa: PLC0415
-
-        if origin is not None and utm is not None:
-            raise ConfigError("origin and utm say the same thing in two ways.", todo="Give one of them.")
-        if origin is not None:
-            lat, lon = origin
-            if not (abs(lat) <= _MAX_UTM_LAT_DEG and abs(lon) <= _MAX_LON_DEG):
-                raise ConfigError(
-                    f"the origin {lat:g},{lon:g} lies outside of UTM.", todo="Give LAT,LON in degrees, latitude first."
-                )
-            zone = min(int((lon + 180.0) // 6.0) + 1, 60)
-            crs = f"EPSG:{(32600 if lat >= 0 else 32700) + zone}"
-            easting, northing = Transformer.from_crs("OGC:CRS84", crs, always_xy=True).transform(lon, lat)
-            return cls(crs, float(easting), float(northing))
-        if utm is None:
-            return None
-        try:
-            known = CRS.from_user_input(utm[0])
-        except CRSError:
-            raise ConfigError(f"unknown CRS {utm[0]!r}.", todo="Give one such as EPSG:32633.") from None
-        if not known.is_projected:
-            raise ConfigError(f"{utm[0]} is not projected.", todo="Give a CRS in metres, such as EPSG:32633.")
-        return cls(utm[0], float(utm[1]), float(utm[2]))
-
-    def to_lonlat(self, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
-        """Return longitude and latitude in degrees; NaN stays NaN and so does what lies outside of the CRS."""
-        from pyproj import Transformer  # noqa: PLC0415  (as above)
-
-        transformer = Transformer.from_crs(self.crs, "OGC:CRS84", always_xy=True)
-        lon, lat = transformer.transform(x_m + self.easting_m, y_m + self.northing_m)
-        return np.where(np.isfinite(lon), lon, np.nan), np.where(np.isfinite(lat), lat, np.nan)
-
-
-def _refuse_placeholders(lon: Floats, lat: Floats, x_m: Floats) -> None:
-    """Raise when positions are in local_x and local_y only: lat and lon are missing, or the same at every node."""
-    if np.isnan(x_m).all():
-        return
-    no_place = np.isnan(lon).all() or np.isnan(lat).all()
-    if no_place or (len(lon) > 1 and np.ptp(lon) == 0.0 and np.ptp(lat) == 0.0):
-        raise InputError(
-            "positions are in local_x and local_y only; lat and lon are missing or all the same.",
-            todo="Say where they count from: --origin LAT,LON or --utm EPSG:32633,E0,N0 (where nodes have an "
-            "mgrs_code, the UTM zone and south-west corner of its square of 100 km).",
-        )
+        return local_lon, local_lat, WGS84
 
 
 def _distance_m(lon: Floats, lat: Floats, other_lon: Floats, other_lat: Floats) -> Floats:
