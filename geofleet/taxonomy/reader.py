@@ -18,13 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
 RAW_PREFIX = "raw:"
 OTHER_GROUP = "other"
 NUMBER = r"(?P<value>\d+(?:[.,]\d+)?)"
+_BEGIN = re.compile(r"(?:[\w ,:/-](?![?*+{]))*", re.ASCII)  # what stands for itself in a pattern
 _IN_BRACKET = re.compile(r"(?<![\w:])(\d+(?:[.,]\d+)?)\s*(km/h|mph|t|m|%)?(?![\w.:-])")
 _LANELET2 = re.compile(r"([a-z]{2})([A-Z]*\d.*)")
 _REGION = re.compile(r"(?:[A-Z]{2,3}:\s*|§\s*)(?=\S)")  # a state or province, or the sign of a paragraph
@@ -154,7 +155,7 @@ def load_taxonomy() -> Taxonomy:
 def _meaning(code: str, country: str, scheme: str) -> Meaning:
     text, land = _normalised(code.strip(), country.upper(), scheme)
     candidates = tuple(dict.fromkeys((text, _without_bracket(text))))
-    for rule in _rules_for(land, scheme):
+    for rule in _rules_for(land, scheme).that_may_match(candidates):
         for candidate in candidates:
             match = rule.pattern.fullmatch(candidate)
             if match:
@@ -163,9 +164,51 @@ def _meaning(code: str, country: str, scheme: str) -> Meaning:
     return Meaning(raw, OTHER_GROUP, "main", None, None, raw, known=False)
 
 
+@dataclass(frozen=True, slots=True)
+class _Rules:
+    """Rules in the order in which they are tried.
+
+    Most are one plain code each, which is looked up (`plain`: its place). A pattern is held against codes that begin as
+    it does (`patterns`: place and beginning, in lower case), and only then compiled.
+    """
+
+    rules: tuple[_Rule, ...]
+    plain: dict[str, int]
+    patterns: tuple[tuple[int, str], ...]
+
+    @classmethod
+    def of(cls, rules: tuple[_Rule, ...]) -> _Rules:
+        plain: dict[str, int] = {}
+        patterns = []
+        for place, rule in enumerate(rules):
+            begin = _BEGIN.match(rule.text)
+            text = begin[0].lower() if begin else ""
+            if len(text) == len(rule.text):
+                plain.setdefault(text, place)
+            else:
+                patterns.append((place, "" if "|" in rule.text else text))
+        return cls(rules, plain, tuple(patterns))
+
+    def that_may_match(self, codes: Sequence[str]) -> Iterator[_Rule]:
+        """Yield what is to be held against some codes, in order."""
+        if not all(map(str.isascii, codes)):  # a pattern that ignores case knows more letters than ours
+            yield from self.rules
+            return
+        lower = [code.lower() for code in codes]
+        first = min(self.plain.get(code, len(self.rules)) for code in lower)
+        for place, begin in self.patterns:
+            if place < first and any(code.startswith(begin) for code in lower):
+                yield self.rules[place]
+        yield from self.rules[first : first + 1]
+
+
 @cache
-def _rules_for(country: str, scheme: str) -> tuple[_Rule, ...]:
+def _rules_for(country: str, scheme: str) -> _Rules:
     """Return the rules to try, in order: one scheme; or a country's, then OpenStreetMap's words."""
+    return _Rules.of(_rules_of(country, scheme))
+
+
+def _rules_of(country: str, scheme: str) -> tuple[_Rule, ...]:
     rules = load_taxonomy().rules
     words = tuple(rule for rule in rules if rule.scheme == "osm")
     if scheme and scheme != "lanelet2":

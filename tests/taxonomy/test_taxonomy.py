@@ -12,7 +12,7 @@ import pytest
 
 from geofleet.config import load_config, packaged_scenarios
 from geofleet.formats.osm_tags import split_value, tagged_signs
-from geofleet.taxonomy import load_taxonomy
+from geofleet.taxonomy import load_taxonomy, reader
 
 TAXONOMY = load_taxonomy()
 
@@ -190,3 +190,18 @@ def test_classes_of_mapillary_in_bremen_are_known(shared_data):
     found = TAXONOMY.classify(pq.read_table(file)["value"].to_pylist(), scheme="mapillary")
     assert len(found.known) == 22_836
     assert found.known.mean() >= 0.95
+
+
+@pytest.mark.parametrize("country", ["DE", "FI", "FR", "US", ""])
+def test_looking_plain_codes_up_finds_what_trying_every_rule_finds(country):
+    rules = reader._rules_for(country, "")
+    codes = {
+        part.replace("{n}", "30").replace("\\", "").strip("()?*+[]")
+        for rule in rules.rules
+        for part in rule.text.replace(reader.NUMBER, "30").split("|")
+    }
+    for code in sorted(codes | {f"{code}[50]" for code in codes} | {code.upper() for code in codes}):
+        candidates = (code, reader._without_bracket(code))
+        every = (rule for rule in rules.rules if any(rule.pattern.fullmatch(one) for one in candidates))
+        chosen = (r for r in rules.that_may_match(candidates) if any(r.pattern.fullmatch(one) for one in candidates))
+        assert next(chosen, None) is next(every, None), code
