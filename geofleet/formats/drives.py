@@ -77,7 +77,7 @@ def read_drive(
     origin: tuple[float, float] | None = None,
     utm: tuple[str, float, float] | None = None,
 ) -> LayerRead:
-    """Read a trajectory as one drive, or as one drive for each name in a column that says so.
+    """Read a trajectory as one drive, or as one drive for each name in a column that says so or simultaneous track.
 
     Parameters
     ----------
@@ -115,13 +115,15 @@ def _read_drive(path: Path, file_format: str, **given: Any) -> LayerRead:
         )
     if found_format != CSV and options:
         raise ConfigError(f"{', '.join(options)} cannot be given for {found_format}.", where=str(path))
-    readers: dict[str, Any] = {RTKLIB: rtklib.read_epochs, NMEA: nmea.read_epochs, GPX: gpx.read_epochs}
+    crs = None
     if found_format == CSV:
         drives, skipped, found = drive_csv.read_epochs(path, **options)
         crs = drive_csv.stated_crs(path, **options)
+    elif found_format == GPX:
+        drives, skipped, found = gpx.read_epochs(path)
     else:
-        epochs, skipped, *notes = readers[found_format](path)
-        drives, found, crs = {"": epochs}, notes[0] if notes else {}, None
+        epochs, skipped, *notes = (rtklib if found_format == RTKLIB else nmea).read_epochs(path)
+        drives, found = {"": epochs}, notes[0] if notes else {}
     layer = _layer(path, found_format, drives, Counter(skipped), Counter(found))
     place = lonlat(layer.table)
     check = PlaceCheck(str(path))

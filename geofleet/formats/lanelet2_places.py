@@ -133,9 +133,9 @@ def placed_by_squares(lon: Floats, lat: Floats, x_m: Floats, y_m: Floats, codes:
             )
         return Placed(lon, lat)
     lon, lat = (np.where(without, np.nan, side) for side in (lon, lat))
-    place = {square: number for number, square in enumerate(known)}
+    place = {code: known.index(square) for code, square in squares.items() if square}
     nowhere = 0 if len(known) == 1 else -1
-    number = np.array([place.get(squares[code], nowhere) for code in codes], np.int64)
+    number = np.array([place.get(code, nowhere) for code in codes], np.int64)
     number[~without | np.isnan(x_m) | np.isnan(y_m)] = -1
     for one, square in enumerate(known):
         rows = np.flatnonzero(number == one)

@@ -79,3 +79,17 @@ def test_what_is_no_track_is_refused(tmp_path, content, message):
     path.write_text(content, encoding="utf-8")
     with pytest.raises(InputError, match=message):
         read_drive(path)
+
+
+def test_tracks_of_the_same_time_are_drives_of_their_own(tmp_path):
+    one = [point(s, 50 + s * 1e-4) for s in range(9)]
+    other = [point(s, 51 + s * 1e-4) for s in range(3, 12)]
+    layer = read_drive(gpx(tmp_path, track(one[:4], one[4:]) + track(other)))
+    assert layer.table["drive_id"].to_pylist() == ["drive-1"] * 9 + ["drive-2"] * 9
+    assert layer.table["segment"].to_pylist() == [0] * 4 + [1] * 5 + [0] * 9
+    assert "duplicate epochs" not in layer.skipped
+    # one after the other, and the same one again, they are one drive
+    layer = read_drive(gpx(tmp_path, track(one[:4]) + track(one[3:]) + track(one)))
+    assert layer.table["drive_id"].to_pylist() == ["drive"] * 9
+    assert layer.table["segment"].to_pylist() == [0] * 4 + [1] * 5
+    assert layer.skipped == {"points that an earlier track has": 10}
