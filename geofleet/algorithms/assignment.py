@@ -11,8 +11,8 @@ from heapq import heappop, heappush
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from geofleet.algorithms.compiled import kernel
 from geofleet.errors import InputError
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def assign_sparse(start: Ints, column: Ints, cost: Floats, *, n_columns: int, sk
     return assigned
 
 
-@njit(cache=True)
+@kernel
 def _assign(graph: _Graph, n_columns: int) -> Ints:
     n_rows = graph.skip_cost.size
     state = _State(
@@ -115,7 +115,7 @@ def _assign(graph: _Graph, n_columns: int) -> Ints:
     return state.column_of_row
 
 
-@njit(cache=True)
+@kernel
 def _take_cheapest(graph: _Graph, state: _State, row: int) -> None:
     """Price a row at its cheapest choice and give it that choice when it is free: all that a lone pair needs."""
     price, cheapest = graph.skip_cost[row], NONE
@@ -127,7 +127,7 @@ def _take_cheapest(graph: _Graph, state: _State, row: int) -> None:
         state.column_of_row[row], state.row_of_column[cheapest] = cheapest, row
 
 
-@njit(cache=True)
+@kernel
 def _search(graph: _Graph, state: _State, source: int, heap: list[tuple[float, int]]) -> _Path:
     """Find the shortest alternating path from a row to a free column or to a row that then stays out (Dijkstra).
 
@@ -157,7 +157,7 @@ def _search(graph: _Graph, state: _State, source: int, heap: list[tuple[float, i
     return _Path(length, end_row, end_column, n_touched)
 
 
-@njit(cache=True)
+@kernel
 def _next_row(state: _State, heap: list[tuple[float, int]]) -> tuple[float, int]:
     """Settle the nearest column and return its distance and the row that holds it; infinite when none is left."""
     while len(heap):
@@ -167,7 +167,7 @@ def _next_row(state: _State, heap: list[tuple[float, int]]) -> tuple[float, int]
     return np.inf, NONE
 
 
-@njit(cache=True)
+@kernel
 def _reprice(state: _State, source: int, path: _Path) -> None:
     """Move the prices of everything settled so that the path costs nothing and no reduced cost falls below 0."""
     state.row_price[source] += path.length
@@ -180,7 +180,7 @@ def _reprice(state: _State, source: int, path: _Path) -> None:
         state.distance[column] = np.inf
 
 
-@njit(cache=True)
+@kernel
 def _augment(state: _State, source: int, path: _Path) -> None:
     """Shift every row of the path to its next column, from the end back to the source."""
     row, column = path.end_row, path.end_column

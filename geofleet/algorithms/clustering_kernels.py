@@ -11,7 +11,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from geofleet.algorithms.compiled import inlined_kernel, kernel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,7 +38,7 @@ class Cells(NamedTuple):
     window: NDArray[np.int32]  # (n_cells, 5, 2) half-open ranges of the cells that can hold a neighbour, one a row
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def radix_argsort(keys: Ints, order: Ints) -> Ints:
     """Sort `order` stably by non-negative `keys`, eleven bits at a time.
 
@@ -63,7 +64,7 @@ def radix_argsort(keys: Ints, order: Ints) -> Ints:
     return source
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cell_starts(keys: Ints, order: Ints) -> Ints:
     """Return where each run of equal keys starts in `order`, and the number of points at the end."""
     first = np.empty(order.size + 1, np.int64)
@@ -76,7 +77,7 @@ def cell_starts(keys: Ints, order: Ints) -> Ints:
     return first[: n_cells + 1].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cell_windows(cell_keys: Ints, row_stride: int) -> NDArray[np.int32]:
     """Return, for every cell and each of five rows, the half-open range of cells within two columns."""
     n_cells = cell_keys.size
@@ -94,7 +95,7 @@ def cell_windows(cell_keys: Ints, row_stride: int) -> NDArray[np.int32]:
     return window
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _sq_distance(coords: tuple[Floats, ...], i: int, j: int) -> float:
     total = 0.0
     for axis in coords:
@@ -102,7 +103,7 @@ def _sq_distance(coords: tuple[Floats, ...], i: int, j: int) -> float:
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _has_neighbours(cells: Cells, cell: int, i: int, sq_eps: float, min_samples: int) -> bool:
     """Return whether point i of a cell with fewer than min_samples points has that many neighbours, itself included."""
     n = cells.first[cell + 1] - cells.first[cell]
@@ -118,7 +119,7 @@ def _has_neighbours(cells: Cells, cell: int, i: int, sq_eps: float, min_samples:
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_cores(cells: Cells, sq_eps: float, min_samples: Ints) -> Flags:
     """Return which points, in cell order, have the min_samples of their cell within eps, themselves included."""
     core = np.zeros(cells.order.size, np.bool_)
@@ -132,7 +133,7 @@ def find_cores(cells: Cells, sq_eps: float, min_samples: Ints) -> Flags:
     return core
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _root(parent: NDArray[np.int32], cell: int) -> int:
     while parent[cell] != cell:
         parent[cell] = parent[parent[cell]]
@@ -140,7 +141,7 @@ def _root(parent: NDArray[np.int32], cell: int) -> int:
     return cell
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _near_box(cells: Cells, points: Ints, others: Ints, sq_eps: float) -> Ints:
     """Return those of `points` that are within eps of the bounding box of `others`."""
     sq_gap = np.zeros(points.size)
@@ -155,7 +156,7 @@ def _near_box(cells: Cells, points: Ints, others: Ints, sq_eps: float) -> Ints:
     return points[sq_gap <= sq_eps * (1 + 1e-12)]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _are_linked(cells: Cells, core: Flags, a: int, b: int, sq_eps: float) -> bool:
     """Return whether a core of cell a is within eps of a core of cell b."""
     first = cells.first
@@ -178,7 +179,7 @@ def _are_linked(cells: Cells, core: Flags, a: int, b: int, sq_eps: float) -> boo
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _connect(cells: Cells, core: Flags, has_core: Flags, sq_eps: float, parent: NDArray[np.int32]) -> None:
     """Join the clusters of neighbouring cells: cells that touch, or the others within reach."""
     for cell in range(has_core.size):
@@ -194,7 +195,7 @@ def _connect(cells: Cells, core: Flags, has_core: Flags, sq_eps: float, parent: 
                     parent[max(a, b)] = min(a, b)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def number_clusters(cells: Cells, core: Flags, sq_eps: float) -> NDArray[np.int32]:
     """Return the cluster of every cell, -1 where there is no core.
 
@@ -225,7 +226,7 @@ def number_clusters(cells: Cells, core: Flags, sq_eps: float) -> NDArray[np.int3
     return cluster
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _adjacent_clusters(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
     cells: Cells, core: Flags, cluster: NDArray[np.int32], cell: int, i: int, sq_eps: float, found: Ints
 ) -> int:
@@ -244,7 +245,7 @@ def _adjacent_clusters(  # noqa: PLR0917  (numba inlines no keyword-only argumen
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def label_points(
     cells: Cells, core: Flags, cluster: NDArray[np.int32], sq_eps: float
 ) -> tuple[Ints, Flags, Ints, Ints]:
@@ -273,7 +274,7 @@ def label_points(
     return labels, is_core, np.array(point, dtype=np.int64), np.array(reached, dtype=np.int64)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def join_parts(order: Ints, point: Ints, cluster: Ints, is_core: Flags) -> tuple[Ints, Ints]:
     """Join clusters that share a core.
 

@@ -10,7 +10,8 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from geofleet.algorithms.compiled import inlined_kernel, kernel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -70,19 +71,19 @@ def index_readers(run: Ints, columns: Mapping[str, NDArray[np.generic]], fine_zo
     return Readers(slots, reader, 1 << fine_zoom, int(counts.max(initial=0)))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def cell_key(run: int, cell_x: int, cell_y: int) -> int:
     """Return a number for a cell of a run; they sort by run, row and column."""
     return int((np.int64(run) << 2 * CELL_BITS) | (np.int64(cell_y) << CELL_BITS) | np.int64(cell_x))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def slot_of(key: int, mask: int) -> int:
     """Spread keys over slots (Fibonacci hashing, Knuth 6.4)."""
     return int(np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)) & mask)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_slots(slots: Ints, keys: Ints, ranges: Ints) -> None:
     mask = len(slots) - 1
     for cell in range(keys.size):
@@ -92,7 +93,7 @@ def _fill_slots(slots: Ints, keys: Ints, ranges: Ints) -> None:
         slots[slot, 0], slots[slot, 1] = keys[cell], ranges[cell]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _find(slots: Ints, key: int) -> int:
     """Return the readers of a cell, -1 if there are none."""
     mask = len(slots) - 1
@@ -102,7 +103,7 @@ def _find(slots: Ints, key: int) -> int:
     return int(slots[slot, 1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _find_beside(slots: Ints, key: int, x: float, y: float) -> int:
     """Return the readers of the cell on whose edge a point lies that another logarithm puts into the next one."""
     for step_x in range(-1, 2):
@@ -114,7 +115,7 @@ def _find_beside(slots: Ints, key: int, x: float, y: float) -> int:
     return EMPTY
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def place(lon_deg: float, lat_deg: float, side: int) -> tuple[float, float]:
     """Return column and row of a cell, with the fraction, as `sql/tiles/located` does."""
     x = (0.0 if lon_deg == 180.0 else lon_deg + 180.0) / 360.0 * side  # noqa: PLR2004  (180 is -180)
@@ -122,7 +123,7 @@ def place(lon_deg: float, lat_deg: float, side: int) -> tuple[float, float]:
     return x, (0.5 - math.log((1.0 + sine) / (1.0 - sine)) / (4.0 * math.pi)) * side
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def deal(run: Ints, lon_deg: Floats, lat_deg: Floats, readers: Readers, n_batches: int) -> tuple[Rows32, Rows32, Ints]:
     """Return who reads which detection.
 
@@ -163,7 +164,7 @@ def deal(run: Ints, lon_deg: Floats, lat_deg: Floats, readers: Readers, n_batche
     return row[:n], reader[:n], start
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def take_rows(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
     dealt: NDArray[np.void],
     row: Rows32,
@@ -202,7 +203,7 @@ def take_rows(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
         record.tile_code, record.is_owned = one.tile_code, one.is_owned
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def unpack_rows(
     dealt: NDArray[np.void],
 ) -> tuple[Floats, Floats, Floats, Floats, Ints, Ints, Ints, Ints, Ints, Ints, NDArray[np.bool_]]:

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
+
+from geofleet.algorithms.compiled import kernel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -168,7 +169,7 @@ def _allowed_m(dt_s: Floats, both_s: Floats, jump_m: float) -> Floats:
     return np.maximum(jump_m, 0.5 * MAX_ACCELERATION_MPS2 * dt_s * both_s)
 
 
-@njit(cache=True)
+@kernel
 def _longest_chain(t_s: Floats, xyz_m: Floats, starts: Ints, jump_m: float, tear_cost: float) -> Flags:
     """Return which pieces are on the best chain; piece p holds epochs starts[p] to starts[p + 1].
 
@@ -202,7 +203,7 @@ def _longest_chain(t_s: Floats, xyz_m: Floats, starts: Ints, jump_m: float, tear
     return kept
 
 
-@njit(cache=True)
+@kernel
 def _follows(t_s: Floats, xyz_m: Floats, before: tuple[int, int], after: tuple[int, int], jump_m: float) -> bool:
     """Tell whether a car can have come from the end of one piece to the start of a later one: first, last epoch."""
     i, j = before[1], after[0]
@@ -218,14 +219,14 @@ def _follows(t_s: Floats, xyz_m: Floats, before: tuple[int, int], after: tuple[i
     return not (has_before or has_after)
 
 
-@njit(cache=True)
+@kernel
 def _fits(gap: Floats, dt: float, step: Floats, step_s: float, jump_m: float) -> bool:
     """Tell whether a gap of dt seconds goes on at the speed of a step, within what an acceleration brings about."""
     off = gap - step * (dt / step_s)
     return bool(np.sqrt((off**2).sum()) <= max(jump_m, 0.5 * MAX_ACCELERATION_MPS2 * dt * (dt + step_s)))
 
 
-@njit(cache=True)
+@kernel
 def _stops(t_s: Floats, xyz_m: Floats, segment: Ints, radius_m: float, least_s: float) -> tuple[Ints, Ints]:
     """Return first and last epoch of each stretch that stays near its first epoch for long enough."""
     n = len(t_s)

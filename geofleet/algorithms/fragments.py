@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
+
+from geofleet.algorithms.compiled import kernel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 END = -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def join_fragments(start: Ints, order: Ints, frame: Ints, first: Ints, second: Ints, n_frames: int) -> Ints:  # noqa: PLR0917 - numba takes no keyword-only arguments
     """Return the group of each track: pairs are joined in the order given, unless their groups share a frame.
 
@@ -50,14 +51,14 @@ def join_fragments(start: Ints, order: Ints, frame: Ints, first: Ints, second: I
     return group
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _root(root: Ints, track: int) -> int:
     while root[track] != track:
         track = root[track]
     return track
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _share_a_frame(  # noqa: PLR0917 - numba takes no keyword-only arguments
     a: int, b: int, mark: int, following: Ints, start: Ints, order: Ints, frame: Ints, stamp: Ints
 ) -> bool:

@@ -11,9 +11,9 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from pyproj import Transformer
 
+from geofleet.algorithms.compiled import kernel
 from geofleet.algorithms.geodesy_kernels import ecef_points, local_axes
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def move_to_members(fused: FusedSigns, lon_deg: Floats, lat_deg: Floats) -> Fuse
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_members(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
     xyz: Floats, origin: Floats, axes: Floats, weight: Floats, pass_code: Ints, first: Ints
 ) -> tuple[Floats, Floats, Ints]:
@@ -158,7 +158,7 @@ def _sum_members(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
     return centre, covariance, n_passes
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _scatter(passes: Floats, total: float, centre: Floats) -> Floats:
     """Return the covariance (ee, nn, en) of a centroid from the scatter of its passes."""
     sum_sq_share = 0.0
@@ -201,7 +201,7 @@ def vote(class_code: Ints, confidence: Floats, first: Ints) -> tuple[Ints, Float
     return _count_votes(class_code, confidence, first, n_classes)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count_votes(class_code: Ints, confidence: Floats, first: Ints, n_classes: int) -> tuple[Ints, Floats]:
     n = first.size - 1
     winner, share = np.empty(n, np.int64), np.empty(n)
@@ -246,7 +246,7 @@ def name_hashes(hashes: NDArray[np.uint64]) -> NDArray[np.bytes_]:
     return names
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def hash_members(pass_hash: NDArray[np.uint64], track_id: Ints, first: Ints) -> NDArray[np.uint64]:
     """Return a hash of every cluster's members in their order, which names it.
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from geofleet.algorithms.compiled import kernel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,7 +20,7 @@ NEAREST_M = 0.1
 """On top of the camera a bearing means nothing: distances count as this at least."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def wrapped(angle_rad: float) -> float:
     """Return an angle between -π and π."""
     turned = angle_rad + np.pi
@@ -28,7 +29,7 @@ def wrapped(angle_rad: float) -> float:
     return turned - np.pi
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def expected(east_m: float, north_m: float, x: float, y: float) -> tuple[float, float, float, float]:
     """Return distance, direction and the unit vector (east, north) from a pose to a place."""
     dx, dy = east_m - x, north_m - y
@@ -45,7 +46,7 @@ class _Frames(NamedTuple):
     azimuth_rad: Floats
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _place_equations(
     frames: _Frames, n: int, east_m: float, north_m: float, sigma: Floats
 ) -> tuple[float, float, float, float, float, float]:
@@ -66,7 +67,7 @@ def _place_equations(
     return ee, en, nn, ge, gn, square
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def locate(  # noqa: PLR0917 - numba takes no keyword-only arguments
     start: Ints,
     order: Ints,
@@ -97,7 +98,7 @@ def locate(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return place
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _settled(frames: _Frames, n: int, east: float, north: float, sigma: Floats) -> tuple[float, float]:
     """Return the place of one track, from a first guess."""
     damping = 1e-3
@@ -117,7 +118,7 @@ def _settled(frames: _Frames, n: int, east: float, north: float, sigma: Floats) 
     return east, north
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def normal_equations(  # noqa: PLR0917 - numba takes no keyword-only arguments
     start: Ints,
     order: Ints,
@@ -149,7 +150,7 @@ def normal_equations(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return matrix, gradient, square
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def misfit(matrix: Floats, gradient: Floats, square: Floats, unit: Floats, tolerance: float) -> tuple[Floats, Ints]:
     """Return the least weighted sum of squares of each track, the bias free as well, and the rank of its matrix.
 
@@ -179,7 +180,7 @@ def misfit(matrix: Floats, gradient: Floats, square: Floats, unit: Floats, toler
     return s0, rank
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _eliminate(left: Floats, right: Floats, p: int) -> None:
     """Take the unknown p out of the equations of the others; its own row and column become 0."""
     pivot = left[p, p]

@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from geofleet.algorithms.compiled import kernel
 from geofleet.algorithms.joint_grid import NOTHING, Grid, file_thing, grid_around, longer, things_around, unfile_thing
 from geofleet.algorithms.joint_offsets import SIGN_DENSITY_M2, Partners, best_offset
 
@@ -70,7 +70,7 @@ def _order(xy_m: Floats, first: Ints, sigma_m: Floats, cell_m: float) -> Ints:
     return order
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _walk(key: Ints, first: Ints, owner: Ints, start: Ints, worth: Floats) -> Ints:
     """Take the pass with the most tracks in cells that are taken already; ties and new beginnings by worth."""
     n = first.size - 1
@@ -120,7 +120,7 @@ def _no_points(n: int) -> _Points:
     return _Points(np.zeros((n, 2)), zeros[0], zeros[1], nothing[0], nothing[1], free, np.full(1, n))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _align(passes: _Passes, order: Ints, base_var: float, points: _Points, grid: Grid) -> Floats:
     n_passes = order.size
     offset = np.zeros((n_passes, 2))
@@ -143,7 +143,7 @@ def _align(passes: _Passes, order: Ints, base_var: float, points: _Points, grid:
     return offset
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _take_out(passes: _Passes, points: _Points, grid: Grid, v: int, offset: Floats) -> None:
     """Take a pass out of the map; a point that only it had keeps its number until the pass is laid again."""
     for i in range(passes.first[v], passes.first[v + 1]):
@@ -151,7 +151,7 @@ def _take_out(passes: _Passes, points: _Points, grid: Grid, v: int, offset: Floa
             _add(passes, points, grid, i, offset, -1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add(passes: _Passes, points: _Points, grid: Grid, i: int, offset: Floats, times: int) -> None:  # noqa: PLR0917 - numba takes no keyword-only arguments
     """Add a track to its point, or take it out again."""
     k = points.of_track[i]
@@ -164,7 +164,7 @@ def _add(passes: _Passes, points: _Points, grid: Grid, i: int, offset: Floats, t
         unfile_thing(grid, k)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _apart(passes: _Passes, points: _Points, i: int, k: int) -> tuple[float, float]:
     """Return the offset that brings a track onto a point."""
     return (
@@ -173,7 +173,7 @@ def _apart(passes: _Passes, points: _Points, i: int, k: int) -> tuple[float, flo
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _partners(passes: _Passes, points: _Points, grid: Grid, v: int, reach_m: float) -> Partners:
     """Return the points of the map within reach of each track of a pass, those of a track from west to east."""
     a, b = passes.first[v], passes.first[v + 1]
@@ -203,7 +203,7 @@ def _partners(passes: _Passes, points: _Points, grid: Grid, v: int, reach_m: flo
     return partners
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _put_by_east(points: _Points, point: Ints, begin: int, end: int, new: int) -> None:
     """Insert a point into a part of the list that is sorted by east, of equals by number."""
     east, at = points.total[new, 0] / points.n_tracks[new], end
@@ -217,7 +217,7 @@ def _put_by_east(points: _Points, point: Ints, begin: int, end: int, new: int) -
     point[at] = new
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _weigh(passes: _Passes, points: _Points, partners: Partners, i: int, r: int) -> None:
     """Say where the partners of a track are, and how much each counts.
 
@@ -238,7 +238,7 @@ def _weigh(passes: _Passes, points: _Points, partners: Partners, i: int, r: int)
         partners.most[at] = 1 / (2 * np.pi * partners.var[r] * SIGN_DENSITY_M2) * partners.weight[at]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _lay(  # noqa: PLR0917 - numba takes no keyword-only arguments
     passes: _Passes, points: _Points, grid: Grid, partners: Partners, v: int, offset: Floats, step: int
 ) -> None:
@@ -262,7 +262,7 @@ def _lay(  # noqa: PLR0917 - numba takes no keyword-only arguments
         _add(passes, points, grid, i, offset, 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest_free(  # noqa: PLR0917 - numba takes no keyword-only arguments
     passes: _Passes, points: _Points, partners: Partners, i: int, r: int, offset: Floats, step: int
 ) -> int:

@@ -16,9 +16,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from geofleet.algorithms.assignment import _assign, _Graph  # the compiled core: one call a pass
+from geofleet.algorithms.compiled import kernel
 from geofleet.algorithms.joint_grid import Grid, file_thing, grid_around, longer, things_around, unfile_thing
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class _Free(NamedTuple):
     size: Ints  # (1,)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sweep(  # noqa: PLR0917 - numba takes no keyword-only arguments
     places: Places, sign: Ints, signs: Signs, log_confusion: Floats, log_prior: Floats, birth_cost: float, grid: Grid
 ) -> Ints:
@@ -139,7 +139,7 @@ def _sweep(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return sign
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _start(places: Places, sign: Ints, signs: Signs, log_confusion: Floats, grid: Grid) -> _Free:
     """File the signs of the tracks that have one, and return the signs that are free."""
     for i in range(len(sign)):
@@ -156,7 +156,7 @@ def _start(places: Places, sign: Ints, signs: Signs, log_confusion: Floats, grid
     return free
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _give_up(signs: Signs, grid: Grid, free: _Free, before: Ints) -> None:
     """Free the signs that a pass was the only witness of."""
     for k in before:
@@ -166,7 +166,7 @@ def _give_up(signs: Signs, grid: Grid, free: _Free, before: Ints) -> None:
             free.size[0] += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add(signs: Signs, places: Places, log_confusion: Floats, i: int, k: int, times: int) -> None:  # noqa: PLR0917 - numba takes no keyword-only arguments
     """Add a track to a sign, or take it out again."""
     ee, nn, en = places.cov_m2[i]
@@ -187,7 +187,7 @@ def _add(signs: Signs, places: Places, log_confusion: Floats, i: int, k: int, ti
         signs.place[k, 2], signs.place[k, 3], signs.place[k, 4] = b / det, a / det, -c / det
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def class_cost(log_class: Floats, log_prior: Floats, log_read: Floats) -> float:
     """Return -log Σ_k π_k M[k, c] with π ∝ exp(log_class + log_prior)."""
     top, top_both = -np.inf, -np.inf
@@ -212,7 +212,7 @@ class _Pairs(NamedTuple):
     known: Ints
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _assign_pass(  # noqa: PLR0917 - numba takes no keyword-only arguments
     places: Places,
     signs: Signs,
@@ -251,7 +251,7 @@ def _assign_pass(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return given
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cost(  # noqa: PLR0917 - numba takes no keyword-only arguments
     places: Places, signs: Signs, i: int, k: int, log_confusion: Floats, log_prior: Floats, most: float
 ) -> float:
@@ -275,7 +275,7 @@ def _cost(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return float(spatial + class_cost(signs.log_class[k], log_prior, read) - usual)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _usual(n_around: int, n_tracks: int) -> float:
     """Return the log-odds that a pass around reports a sign of so many tracks: Laplace's rule, of the other passes."""
     if n_around == 0:
@@ -283,7 +283,7 @@ def _usual(n_around: int, n_tracks: int) -> float:
     return float(np.log((n_tracks + 1) / (max(n_around - 1 - n_tracks, 0) + 1)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _adopt_fragments(given: Ints, pairs: _Pairs, places: Places, a: int, birth_cost: float) -> None:
     """Let tracks that stayed out join a sign whose tracks of this pass share no frame with them, the cheapest first."""
     for r in range(given.size):
@@ -296,7 +296,7 @@ def _adopt_fragments(given: Ints, pairs: _Pairs, places: Places, a: int, birth_c
         given[r] = best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _never_with(given: Ints, column: int, places: Places, a: int, r: int) -> bool:
     """Return whether row r shares no frame with any row of the pass that has this sign."""
     for other in range(given.size):  # noqa: SIM110 - numba compiles no generator
@@ -305,7 +305,7 @@ def _never_with(given: Ints, column: int, places: Places, a: int, r: int) -> boo
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def overlap(places: Places, i: int, j: int) -> bool:
     """Return whether two tracks of a pass may share a frame; where frames are not told, they may."""
     first, last = places.frame_first, places.frame_last

@@ -8,7 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from geofleet.algorithms.compiled import kernel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,7 +43,7 @@ def grid_around(xy_m: Floats, size_m: float, n_things: int) -> Grid:
     return Grid(keys, low, width, size_m, np.full(len(keys), NOTHING), nowhere[0], nowhere[1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_from(sorted_keys: Ints, key: int) -> int:
     """Return where the first key stands that is not below this one."""
     low, high = 0, sorted_keys.size
@@ -55,7 +56,7 @@ def first_from(sorted_keys: Ints, key: int) -> int:
     return low
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def file_thing(grid: Grid, thing: int, east: float, north: float) -> None:
     """File a thing under the cell of its place, and take it from where it stood.
 
@@ -73,7 +74,7 @@ def file_thing(grid: Grid, thing: int, east: float, north: float) -> None:
     grid.head[at] = thing
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def unfile_thing(grid: Grid, thing: int) -> None:
     """Take a thing out of its cell."""
     at = grid.cell[thing]
@@ -87,7 +88,7 @@ def unfile_thing(grid: Grid, thing: int) -> None:
     grid.following[other] = grid.following[thing]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def things_around(grid: Grid, east: float, north: float, found: Ints) -> tuple[Ints, int]:
     """Return the things in the nine cells around a place, and their number: in `found`, or in a longer array."""
     column = int(np.floor((east - grid.low[0]) / grid.size_m))  # floored once: neighbours are whole steps away
@@ -108,7 +109,7 @@ def things_around(grid: Grid, east: float, north: float, found: Ints) -> tuple[I
     return found, n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def longer(values: Ints) -> Ints:
     """Return the values with room for as many more."""
     grown = np.empty(2 * values.size, np.int64)

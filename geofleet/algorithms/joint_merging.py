@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
+from geofleet.algorithms.compiled import kernel
 from geofleet.algorithms.joint_association import GATE_CHI2, REACH_M, Places, overlap
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def _sums(places: Places, sign: Ints, n_signs: int) -> tuple[Floats, Floats]:
     return xy_m, np.column_stack((b, a, -c)) / whole[:, None]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join_once(one: Ints, two: Ints, n_signs: int) -> Ints:
     """Join pairs in the order given, each sign once."""
     root, used = np.arange(n_signs), np.zeros(n_signs, np.bool_)
@@ -86,7 +86,7 @@ def _join_once(one: Ints, two: Ints, n_signs: int) -> Ints:
     return root
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _passes_of_pairs(  # noqa: PLR0917 - numba takes no keyword-only arguments
     one: Ints, two: Ints, by_sign: Ints, start: Ints, owner: Ints, places: Places
 ) -> tuple[Ints, Ints]:
@@ -110,14 +110,14 @@ def _passes_of_pairs(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return n_both, n_lonely
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _end_of(tracks: Ints, begin: int, owner: Ints, v: int) -> int:
     while begin < tracks.size and owner[tracks[begin]] == v:
         begin += 1
     return begin
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _meet(mine: Ints, theirs: Ints, places: Places) -> bool:
     """Return whether any two tracks of a pass share a frame."""
     for i in mine:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from geofleet.algorithms.compiled import kernel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,7 +39,7 @@ class Partners(NamedTuple):
     var: Floats  # (n_rows,)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gain(partners: Partners, east: float, north: float, step: int) -> tuple[float, float, float]:
     """Return the log-likelihood of an offset by every so many-th track, and the offset that their partners agree on."""
     value, weight, sum_e, sum_n = 0.0, 1e-12, 0.0, 0.0
@@ -61,7 +62,7 @@ def _gain(partners: Partners, east: float, north: float, step: int) -> tuple[flo
     return value, sum_e / weight, sum_n / weight
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def best_offset(partners: Partners, sigma2: float, offset: Floats) -> tuple[float, float]:
     """Return the likeliest offset, among those that bring a track onto a point of its class and the present one."""
     best, found_e, found_n = -np.inf, offset[0], offset[1]
@@ -81,7 +82,7 @@ def best_offset(partners: Partners, sigma2: float, offset: Floats) -> tuple[floa
     return found_e, found_n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _put_likeliest_first(partners: Partners) -> None:
     """Put the partner of each track that counts most first: few of the others can then be better."""
     for r in range(partners.var.size):
@@ -101,7 +102,7 @@ def _put_likeliest_first(partners: Partners) -> None:
             partners.is_same[begin], partners.is_same[first] = partners.is_same[first], partners.is_same[begin]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _candidates(partners: Partners, offset: Floats) -> Floats:
     """Return the present offset, and those that bring a track onto a point of its class, (n, 2).
 
@@ -117,7 +118,7 @@ def _candidates(partners: Partners, offset: Floats) -> Floats:
     return found[:n] if n <= FEW_OFFSETS else _voted(found[:n])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _voted(offsets: Floats) -> Floats:
     """Return the first offset, and the first one of each of the cells with most of the others in and beside it."""
     n = len(offsets)
@@ -142,7 +143,7 @@ def _voted(offsets: Floats) -> Floats:
     return chosen[:n_chosen]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cells(values: Floats) -> tuple[Ints, int]:
     """Return the cell of each value along one axis, none of them at the rim, and the number of cells."""
     low, cell, n = np.inf, np.empty(values.size, np.int64), 0

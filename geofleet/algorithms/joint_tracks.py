@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from geofleet.algorithms.compiled import kernel
 from geofleet.algorithms.information import about_bias, bias_posterior
 
 if TYPE_CHECKING:
@@ -260,7 +260,7 @@ def _fragments(tracks: Tracks, xy_m: Floats, cov: Floats) -> Ints:
     return np.unique(group, return_inverse=True)[1].astype(np.int64)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join(  # noqa: PLR0917
     pass_code: Ints, class_code: Ints, first: Ints, last: Ints, frames: Floats, xy_m: Floats, cov: Floats
 ) -> Ints:
@@ -284,7 +284,7 @@ def _join(  # noqa: PLR0917
     return group
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_apart(group: Ints, first: Ints, last: Ints, frames: Floats, lead: int, other: int) -> bool:  # noqa: PLR0917
     """Return whether a track likely shares no frame with any member of the group of `lead`."""
     for k in range(lead, other):

@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from geofleet.algorithms.assignment import NONE, _assign, _Graph  # the compiled core: one call a frame
+from geofleet.algorithms.compiled import kernel
 from geofleet.algorithms.information_kernels import expected, wrapped
 from geofleet.algorithms.tracking_kernels import _without_stale
 
@@ -62,7 +62,7 @@ class _Tracks(NamedTuple):
     weight: Floats  # (VOTES_AWAY + 1,)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def associate_filtered(  # noqa: PLR0917 - numba takes no keyword-only arguments
     frame_start: Ints, range_m: Floats, azimuth_rad: Floats, class_code: Ints, pose_xy_m: Floats, model: Filter
 ) -> Ints:
@@ -119,7 +119,7 @@ def associate_filtered(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return track
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def associate_filtered_passes(  # noqa: PLR0917 - numba takes no keyword-only arguments
     pass_start: Ints,
     frame_start: Ints,
@@ -163,7 +163,7 @@ def associate_filtered_passes(  # noqa: PLR0917 - numba takes no keyword-only ar
     return track
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pairs(  # noqa: PLR0917 - numba takes no keyword-only arguments
     live: Ints,
     n_live: int,
@@ -209,13 +209,13 @@ def _pairs(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return is_contested
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _misread(model: Filter) -> float:
     """Return the chance to read one certain wrong class."""
     return model.class_error_rate / max(model.n_classes - 1, 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _weights(model: Filter) -> Floats:
     weights = np.ones(VOTES_AWAY + 1)
     for k in range(VOTES_AWAY):
@@ -223,7 +223,7 @@ def _weights(model: Filter) -> Floats:
     return weights
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _log_class(tracks: _Tracks, t: int, class_code: int, model: Filter) -> float:
     """Return ln Σ_k π_k M_kc: the chance to read this class on the sign that track t read like this before."""
     if model.n_classes == 1:
@@ -240,7 +240,7 @@ def _log_class(tracks: _Tracks, t: int, class_code: int, model: Filter) -> float
     return likelihood
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _innovation_cov(  # noqa: PLR0917 - numba takes no keyword-only arguments
     cov: Floats, t: int, distance: float, ux: float, uy: float, model: Filter
 ) -> tuple[float, float, float]:
@@ -255,7 +255,7 @@ def _innovation_cov(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return rr, rx * r0 + ry * r1 + r3, aa
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _begin(  # noqa: PLR0917 - numba takes no keyword-only arguments
     tracks: _Tracks, t: int, range_m: float, azimuth_rad: float, x: float, y: float, model: Filter
 ) -> None:
@@ -276,7 +276,7 @@ def _begin(  # noqa: PLR0917 - numba takes no keyword-only arguments
             cov[t, 2 + p, 2 + q] = bias_cov[p, q]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _update(  # noqa: PLR0917 - numba takes no keyword-only arguments
     tracks: _Tracks, t: int, range_m: float, azimuth_rad: float, x: float, y: float, model: Filter
 ) -> None:
@@ -289,7 +289,7 @@ def _update(  # noqa: PLR0917 - numba takes no keyword-only arguments
     _take_in(mean, cov, t, -uy / distance, ux / distance, 3, error, model.bearing_var_rad2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _take_in(  # noqa: PLR0917 - numba takes no keyword-only arguments
     mean: Floats, cov: Floats, t: int, hx: float, hy: float, own: int, error: float, noise_var: float
 ) -> None:

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from geofleet.algorithms.assignment import NONE, assign_sparse
+from geofleet.algorithms.compiled import kernel
 from geofleet.errors import InputError
 
 if TYPE_CHECKING:
@@ -182,7 +182,7 @@ def _ordered(at: Floats, codes: Ints | None, *, gate_m: float) -> _Points:
     return _Points(at[place], strip[place], code[place], place)
 
 
-@njit(cache=True)
+@kernel
 def _sorted_along_strips(place: Ints, code: Ints, strip: Floats, along: Floats) -> Ints:
     """Sort an order by code and position across the strips into one by code, strip and position along the strip.
 
@@ -199,7 +199,7 @@ def _sorted_along_strips(place: Ints, code: Ints, strip: Floats, along: Floats) 
     return ordered
 
 
-@njit(cache=True)
+@kernel
 def _pairs_in_gate(points: _Points, ref: _Points, gate_m: float) -> tuple[Ints, Ints, Floats]:
     """Return all pairs of equal code with d < gate as CSR (start, column, d²), columns ascending in a row.
 
@@ -232,7 +232,7 @@ def _pairs_in_gate(points: _Points, ref: _Points, gate_m: float) -> tuple[Ints, 
     return start, column[:n_pairs], sq_distance_m2[:n_pairs]
 
 
-@njit(cache=True)
+@kernel
 def _ahead(code: int, strip: float, along: float, code_0: int, strip_0: float, along_0: float) -> float:  # noqa: PLR0917 (a kernel: numbers are passed in registers, structs are not)
     """Return how far a point is ahead of a place in canonical order, metres; infinite in another code or strip."""
     if code != code_0:
@@ -242,7 +242,7 @@ def _ahead(code: int, strip: float, along: float, code_0: int, strip_0: float, a
     return along - along_0
 
 
-@njit(cache=True)
+@kernel
 def _sq_distance(a: Floats, i: int, b: Floats, k: int) -> float:
     total = 0.0
     for axis in range(a.shape[1]):
@@ -250,6 +250,6 @@ def _sq_distance(a: Floats, i: int, b: Floats, k: int) -> float:
     return total
 
 
-@njit(cache=True)
+@kernel
 def _doubled(array: Any) -> Any:
     return np.concatenate((array, np.empty_like(array)))

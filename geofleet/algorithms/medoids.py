@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from geofleet.algorithms.compiled import inlined_kernel, kernel
 from geofleet.errors import InputError
 
 if TYPE_CHECKING:
@@ -101,13 +101,13 @@ def _check(xy: Floats, k: int) -> None:
         raise InputError(f"{k} medoids of {len(xy)} points.", where="k-medoids", todo="Give 1 to the number of points.")
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _sq(xy: Floats, i: int, j: int) -> float:
     east, north = xy[i, 0] - xy[j, 0], xy[i, 1] - xy[j, 1]
     return float(east * east + north * north)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _most_central(xy: Floats) -> int:
     best, best_sum = 0, np.inf
     for i in range(len(xy)):
@@ -119,7 +119,7 @@ def _most_central(xy: Floats) -> int:
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gain(xy: Floats, candidate: int, sq_near: Floats, near_m: Floats) -> float:
     total = 0.0
     for j in range(len(xy)):
@@ -129,7 +129,7 @@ def _gain(xy: Floats, candidate: int, sq_near: Floats, near_m: Floats) -> float:
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _build(xy: Floats, k: int) -> Ints:
     n = len(xy)
     medoids = np.empty(k, np.int64)
@@ -151,7 +151,7 @@ def _build(xy: Floats, k: int) -> Ints:
     return medoids
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _settle(xy: Floats, medoids: Ints, state: _State, j: int) -> None:
     """Find the two nearest medoids of a point."""
     state.sq_near[j] = state.sq_second[j] = np.inf
@@ -164,7 +164,7 @@ def _settle(xy: Floats, medoids: Ints, state: _State, j: int) -> None:
             state.second[j], state.sq_second[j] = m, sq
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _removal_losses(state: _State, k: int) -> Floats:
     """Return how much the loss grows when a medoid is taken away."""
     losses = np.zeros(k)
@@ -173,7 +173,7 @@ def _removal_losses(state: _State, k: int) -> Floats:
     return losses
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best_swap(xy: Floats, candidate: int, state: _State, removal: Floats) -> tuple[float, int]:
     """Return the change of the loss, and the medoid to replace, when a point becomes a medoid."""
     change, own = removal.copy(), 0.0
@@ -191,7 +191,7 @@ def _best_swap(xy: Floats, candidate: int, state: _State, removal: Floats) -> tu
     return change[place] + own, place
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _replace(xy: Floats, medoids: Ints, state: _State, place: int) -> None:
     """Bring the state up to date after the medoid at `place` has been replaced."""
     for j in range(len(xy)):
@@ -206,7 +206,7 @@ def _replace(xy: Floats, medoids: Ints, state: _State, place: int) -> None:
             state.second[j], state.sq_second[j] = place, sq
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _swap_all(xy: Floats, medoids: Ints) -> tuple[Ints, Ints, float]:
     n, k = len(xy), medoids.size
     state = _State(np.zeros(n, np.int64), np.zeros(n, np.int64), np.empty(n), np.empty(n))

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
+
+from geofleet.algorithms.compiled import kernel
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -49,7 +50,7 @@ def occluded(frame: Ints, sign: Ints, *, share: float, mean_frames: float, rng: 
     return hidden
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _chain(  # noqa: PLR0917 - numba takes no keyword-only arguments
     frame: Ints, sign: Ints, n_signs: int, share: float, memory: float, uniform: Floats
 ) -> Flags:

@@ -11,8 +11,8 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from geofleet.algorithms.compiled import kernel
 from geofleet.errors import InputError
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def view_chances(
     return chances[back], counts[back]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _heading(path_xy: Floats, a: int, b: int, i: int) -> tuple[float, float]:
     """Return the unit vector from the vertex before to the vertex after, zero where the car did not move."""
     before, after = max(i - 1, a), min(i + 1, b - 1)
@@ -119,7 +119,7 @@ def _heading(path_xy: Floats, a: int, b: int, i: int) -> tuple[float, float]:
     return (east / length, north / length) if length > 0 else (0.0, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
     xy: Floats,
     view_xy: Floats,

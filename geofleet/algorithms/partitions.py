@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numba import njit
 
+from geofleet.algorithms.compiled import kernel
 from geofleet.algorithms.medoids import build, fasterpam
 from geofleet.errors import InputError
 
@@ -188,7 +188,7 @@ def silhouette(xy: Floats, labels: Ints) -> float:
     return float(_silhouette(np.ascontiguousarray(xy), labels, int(labels.max()) + 1))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _silhouette(xy: Floats, labels: Ints, k: int) -> float:
     size, total = np.bincount(labels, minlength=k), 0.0
     for i in range(len(xy)):

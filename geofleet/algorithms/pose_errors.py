@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
+
+from geofleet.algorithms.compiled import kernel
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -43,7 +44,7 @@ def wrong_fixes(along_m: Floats, *, per_km: float, length_m: float, sigma_m: flo
     return offset
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _recursion(keep: Floats, noise: Floats) -> Floats:
     """Return x_k = a_k x_(k-1) + √(1 - a_k²) w_k, a being `keep`; a_0 is 0."""
     state = np.empty_like(noise)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from pyproj import Geod
 from scipy.spatial import cKDTree
 
+from geofleet.algorithms.compiled import kernel
 from geofleet.algorithms.geodesy import to_ecef
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def is_repeated(xy_m: Floats, sign_class: Sequence[str], support_id: Sequence[st
     return repeated
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _near_line(xy_m: Floats, line_xy_m: Floats, starts: Ints, corridor_m: float) -> Flags:
     near = np.zeros(len(xy_m), dtype=np.bool_)
     for part in range(len(starts) - 1):

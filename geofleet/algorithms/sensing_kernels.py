@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
+
+from geofleet.algorithms.compiled import kernel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,7 +18,7 @@ ROUNDING_M = 1e-6
 """A view cone is taken to be this much larger when cells are chosen: rounding must not lose a sign on its edge."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
     pose_xy_m: Floats,
     heading_rad: Floats,
@@ -61,7 +62,7 @@ def in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return frames[:n].copy(), signs[:n].copy(), distances[:n].copy(), bearings
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cones(  # noqa: PLR0917 - numba takes no keyword-only arguments
     pose_xy_m: Floats,
     heading_rad: Floats,
@@ -91,7 +92,7 @@ def _cones(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return ahead, cells, n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cells(  # noqa: PLR0917 - numba takes no keyword-only arguments
     place_m: float,
     ahead: float,
@@ -114,7 +115,7 @@ def _cells(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return max(first, 0), max(min(last + 1, n_cells), 0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def by_frame(first: Ints, second: Ints) -> Ints:
     """Return the order that merges two runs of rows by frame, numbered through both; of equals, `first` comes first."""
     order = np.empty(len(first) + len(second), np.int64)
@@ -127,7 +128,7 @@ def by_frame(first: Ints, second: Ints) -> Ints:
     return order
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project(
     frame: Ints, range_m: Floats, bearing_rad: Floats, pose_xy_m: Floats, heading_rad: Floats
 ) -> tuple[Floats, Floats]:

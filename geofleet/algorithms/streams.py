@@ -11,9 +11,10 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.random import Generator
 from numpy.random.bit_generator import ISeedSequence
+
+from geofleet.algorithms.compiled import kernel
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -196,7 +197,7 @@ def _entropy(seed: int, spawn_key: tuple[int, ...]) -> NDArray[np.int64]:
     return words
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _state(words: NDArray[np.int64], n: int) -> NDArray[np.uint32]:
     """Mix words into a pool of four and return n words of state (M. E. O'Neill's `seed_seq_fe`, as numpy runs it)."""
     pool, constant = np.empty(_POOL, np.int64), 0x43B0D7E5
@@ -215,7 +216,7 @@ def _state(words: NDArray[np.int64], n: int) -> NDArray[np.uint32]:
     return state
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _hashed(word: int, constant: int, factor: int) -> tuple[int, int]:
     """Hash a word of 32 bits; return it with the next constant. Products wrap, and their low 32 bits are right."""
     after = (constant * factor) & _WORD

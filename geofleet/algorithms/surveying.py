@@ -9,8 +9,8 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from geofleet.algorithms.compiled import kernel
 from geofleet.algorithms.dealing import CELL_BITS, EMPTY, cell_key, place, slot_of
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ _WORD_BITS = 64
 _FIRST_SLOTS = 1 << 12
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def number_combinations(outer: Codes, middle: Codes, inner: Codes, number: Codes) -> tuple[Codes, Ints]:
     """Give the combinations of three codes numbers in the order in which they appear.
 
@@ -53,7 +53,7 @@ def number_combinations(outer: Codes, middle: Codes, inner: Codes, number: Codes
     return of_row, first[:n].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def are_placed(lon_deg: Floats, lat_deg: Floats) -> bool:
     """Return whether all positions are finite and where tiles can be; NaN is not."""
     good = True
@@ -62,7 +62,7 @@ def are_placed(lon_deg: Floats, lat_deg: Floats) -> bool:
     return good
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mark_ids(bits: NDArray[np.uint64], pass_number: Codes, track_id: Ints, low: int) -> bool:
     """Mark the track ids of every pass, and return whether none was marked before.
 
@@ -115,7 +115,7 @@ class CellCounts:
         return keys >> 2 * CELL_BITS, keys & mask, (keys >> CELL_BITS) & mask, counts[order]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
     slots: Ints, n_cells: int, run: Codes, lon_deg: Floats, lat_deg: Floats, side: int, begin: int
 ) -> tuple[int, int]:
@@ -136,7 +136,7 @@ def _count(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
     return run.size, n_cells
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _grown(slots: Ints) -> Ints:
     """Return the table with four times the slots."""
     larger = np.full((4 * len(slots), 2), EMPTY, np.int64)
@@ -150,7 +150,7 @@ def _grown(slots: Ints) -> Ints:
     return larger
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mean_variances(sigma_e_m: Floats, sigma_n_m: Floats, n_frames: Ints) -> Floats:
     """Return the variance of the mean over the frames of each detection, an axis, m², as `sql/aggregate/judged` does.
 

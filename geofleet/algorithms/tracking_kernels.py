@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from geofleet.algorithms.assignment import NONE
+from geofleet.algorithms.compiled import inlined_kernel, kernel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -15,11 +15,6 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
     Flags = NDArray[np.bool_]
-
-
-_inlined = njit(cache=True, nogil=True, inline="always")
-"""Compiles what runs for every frame into its caller: a call hands over each part of every array, which cost as much as
-the work did."""
 
 
 class _Room(NamedTuple):
@@ -40,7 +35,7 @@ class _Room(NamedTuple):
     is_settled: Flags
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _room(n_a: int, n_b: int) -> _Room:
     n = n_a + n_b
     return _Room(
@@ -69,7 +64,7 @@ class _Pairs(NamedTuple):
     gate_m: float
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def match_within(a_xy_m: Floats, b_xy_m: Floats, gate_m: float) -> Ints:
     """Return for every point of `a` its partner in `b`, or `NONE`: optimal one-to-one under a gate.
 
@@ -82,7 +77,7 @@ def match_within(a_xy_m: Floats, b_xy_m: Floats, gate_m: float) -> Ints:
     return room.partner
 
 
-@_inlined
+@inlined_kernel
 def _match(pairs: _Pairs, room: _Room) -> None:
     """Write the partner of each row of `a`, or `NONE`, into the room."""
     is_contested = False
@@ -104,7 +99,7 @@ def _match(pairs: _Pairs, room: _Room) -> None:
         _decide(pairs, room)
 
 
-@_inlined
+@inlined_kernel
 def _decide(pairs: _Pairs, room: _Room) -> None:
     """Give the contested points of `a` their partners: each component of the gate graph that is contested, whole."""
     for k in range(pairs.n_rows):
@@ -115,7 +110,7 @@ def _decide(pairs: _Pairs, room: _Room) -> None:
             _assign_members(pairs, room, n_members)
 
 
-@_inlined
+@inlined_kernel
 def _is_contested(partner: Ints, n_rows: int, row: int) -> bool:
     n_wanting = 0
     for k in range(n_rows):
@@ -123,7 +118,7 @@ def _is_contested(partner: Ints, n_rows: int, row: int) -> bool:
     return n_wanting > 1
 
 
-@_inlined
+@inlined_kernel
 def _gated(pairs: _Pairs, k: int, j: int) -> float:
     """Return the distance of a point of `a` from one of `b`, infinite when it is not below the gate."""
     at, to = pairs.rows[k], pairs.first + j
@@ -132,7 +127,7 @@ def _gated(pairs: _Pairs, k: int, j: int) -> float:
     return float(np.sqrt(square)) if square < pairs.gate_m * pairs.gate_m else np.inf
 
 
-@_inlined
+@inlined_kernel
 def _component(pairs: _Pairs, room: _Room, start: int) -> int:
     """Write the rows that `start` reaches over pairs within the gate, itself first; return how many they are."""
     room.member[0], room.is_member[start], n, done = start, True, 1, 0
@@ -147,7 +142,7 @@ def _component(pairs: _Pairs, room: _Room, start: int) -> int:
     return n
 
 
-@_inlined
+@inlined_kernel
 def _assign_members(pairs: _Pairs, room: _Room, n_members: int) -> None:
     """Assign by shortest augmenting paths: one pair less never pays, for that costs more than all pairs together."""
     n_b = pairs.last - pairs.first
@@ -169,7 +164,7 @@ def _assign_members(pairs: _Pairs, room: _Room, n_members: int) -> None:
             room.partner[room.member[room.row_of_column[j]]] = j
 
 
-@_inlined
+@inlined_kernel
 def _search(pairs: _Pairs, room: _Room, source: int, n_members: int, stay_out: float) -> int:
     """Find the shortest alternating path, in reduced costs, from a member to a free column; return that column."""
     n_b = pairs.last - pairs.first
@@ -193,7 +188,7 @@ def _search(pairs: _Pairs, room: _Room, source: int, n_members: int, stay_out: f
         row = room.row_of_column[column]
 
 
-@_inlined
+@inlined_kernel
 def _reprice(room: _Room, source: int, end: int, n_columns: int) -> None:
     """Keep reduced costs at zero on what is paired, and not below it elsewhere."""
     length = room.distance[end]
@@ -204,7 +199,7 @@ def _reprice(room: _Room, source: int, end: int, n_columns: int) -> None:
             room.column_price[j] -= length - room.distance[j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def associate(  # noqa: PLR0917 - numba takes no keyword-only arguments
     frame_start: Ints,
     xy_m: Floats,
@@ -252,7 +247,7 @@ def associate(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return track
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def associate_passes(  # noqa: PLR0917 - numba takes no keyword-only arguments
     pass_start: Ints,
     frame_start: Ints,
@@ -288,7 +283,7 @@ def associate_passes(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return track
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _without_stale(live: Ints, n_live: int, last_frame: Ints, oldest: int) -> int:
     """Drop from `live` the tracks last seen before frame `oldest`; return how many are left."""
     kept = 0
@@ -299,7 +294,7 @@ def _without_stale(live: Ints, n_live: int, last_frame: Ints, oldest: int) -> in
     return kept
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _still_in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
     live: Ints,
     n_live: int,
@@ -324,7 +319,7 @@ def _still_in_view(  # noqa: PLR0917 - numba takes no keyword-only arguments
     return kept
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def moments(track: Ints, xy_m: Floats, n_tracks: int) -> tuple[Ints, Floats, Floats]:
     """Return of each track the number of detections, the mean position and the sums of squares ee, nn, en about it.
 
@@ -344,7 +339,7 @@ def moments(track: Ints, xy_m: Floats, n_tracks: int) -> tuple[Ints, Floats, Flo
     return count, mean, scatter
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def majority(track: Ints, value: Ints, n_tracks: int) -> tuple[Ints, Ints]:
     """Return the most frequent value of each track and how often it occurs; of equals, the smallest value."""
     start = np.zeros(n_tracks + 1, dtype=np.int64)
@@ -369,7 +364,7 @@ def majority(track: Ints, value: Ints, n_tracks: int) -> tuple[Ints, Ints]:
     return winner, votes
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def spans(track: Ints, frame: Ints, n_tracks: int) -> tuple[Ints, Ints]:
     """Return the frames of the first and the last detection of each track; detections are by frame."""
     first, last = np.full(n_tracks, NONE), np.full(n_tracks, NONE)

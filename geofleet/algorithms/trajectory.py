@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from geofleet.algorithms.compiled import kernel
 from geofleet.errors import InputError
 
 if TYPE_CHECKING:
@@ -239,7 +239,7 @@ def _at(line: DriveLine, along_m: Floats) -> Floats:
     return np.column_stack([np.interp(along_m, line.along_m, line.xy_m[:, axis]) for axis in (0, 1)])
 
 
-@njit(cache=True)
+@kernel
 def _moving(xy_m: Floats, segment: Ints, step_m: float) -> Ints:
     """Return the epochs to keep: the first of a segment, and each that is a step away from the last one kept."""
     kept = np.empty(len(xy_m), dtype=np.int64)
