@@ -28,7 +28,7 @@ from geofleet.algorithms.sensing_chain import sense_passes
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import TrackerModel, track_paper
 from geofleet.config import load_config
-from geofleet.formats.layers import read_layer
+from geofleet.formats.layers import read_drives, read_layer
 from geofleet.steps.ingest import ingest_drive, ingest_signs
 from geofleet.steps.simulate import simulate
 from geofleet.tables.fleets import Fleet, load_fleet
@@ -192,12 +192,9 @@ def main() -> None:
         folder = Path(name)
         ingest_signs([RAW / "helsinki.osm.pbf"], folder / "signs.parquet")
         ingest_drive([RAW / "helsinki_derived.pos"], folder / "drive.parquet")
-        signs = folder / "signs.parquet"
-        compare(
-            load_fleet(
-                read_layer(signs).table, folder / "drive.parquet", source=signs, config=load_config(args.scenario)
-            )
-        )
+        signs, drive = folder / "signs.parquet", folder / "drive.parquet"
+        layer, driven = read_layer(signs).table, read_drives(drive).table
+        compare(load_fleet(layer, driven, source=signs, drive=drive, config=load_config(args.scenario)))
         if args.passes:
             whole_step(folder, args.scenario, args.passes)
 

@@ -24,8 +24,8 @@ from geofleet.algorithms.sensing_chain import sense_pass
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import track_ideal, track_paper, track_pass
 from geofleet.config import load_config
-from geofleet.formats.layers import read_layer
-from geofleet.steps.ingest import ingest_drive, ingest_signs
+from geofleet.formats.layers import read_drives, read_layer
+from geofleet.steps.ingest import ingest_signs
 from geofleet.tables.fleets import Fleet, load_fleet
 
 if TYPE_CHECKING:
@@ -103,8 +103,8 @@ def main() -> None:
         ingest_signs([RAW / "helsinki.osm.pbf"], signs)
         layer = read_layer(signs).table
         for title, file in DRIVES.items():
-            drive = Path(name) / "drive.parquet"
-            ingest_drive([RAW / file], drive)
+            drive = RAW / file
+            driven = read_drives(drive).table
             print(f"{title}, {args.passes} passes, seed {args.seed}")
             print("scenario      tracker   split   purity   ghosts a km: as it is   x10   one lasting a km")
             for scenario in SCENARIOS:
@@ -113,7 +113,10 @@ def main() -> None:
                 for tracker in TRACKERS:
                     fleets = [
                         load_fleet(
-                            layer, drive, source=signs, config=load_config(scenario, {"tracker": tracker} | extra)
+                            *(layer, driven),
+                            source=signs,
+                            drive=drive,
+                            config=load_config(scenario, {"tracker": tracker} | extra),
                         )
                         for extra in ({}, {"ghost_rate_per_ha": 10 * rate}, {"ghost_tracks_per_km": 1.0})
                     ]

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from geofleet.algorithms.trajectory import resample
-from geofleet.formats.layers import read_layer
+from geofleet.formats.layers import read_drives, read_layer
 from geofleet.tables.scenes import load_drive
 from geofleet.tables.schemas import SIGNS
 from geofleet.tables.store import build_table, write_table
@@ -71,7 +71,7 @@ def plates_on(n_poles: int, classes: pa.Table, rng: Generator) -> tuple[Ints, In
 
 def place(drive: Path, out: Path, *, per_km: float, gap_m: float, side: str, like: Path, seed: int) -> int:
     """Write the layer and return its number of signs."""
-    rng, driven = np.random.default_rng(seed), load_drive(drive)
+    rng, driven = np.random.default_rng(seed), load_drive(read_drives(drive).table, drive)
     way = resample(driven.line, spacing_m=1.0, heading_baseline_m=9.0)
     near = np.searchsorted(way.along_m, poles_along(way.along_m[-1], per_km=per_km, gap_m=gap_m, rng=rng))
     beside_m = rng.uniform(*BESIDE_M, len(near)) * (1 if side == "left" else -1)

@@ -1,4 +1,4 @@
-"""Any layer of signs or roads named on a command line: recognised by its content, read by the module of its format."""
+"""Any layer or drive named on a command line: recognised by its content, read by the module of its format."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from geofleet.formats import osm
 from geofleet.formats.osm_value import is_own_osm
 from geofleet.formats.reading import BZIP2, GZIP, LayerRead, LayerStream, read_head, unpacked_head
 from geofleet.formats.xml import root_tag
-from geofleet.tables.schemas import LANES, SIGNS, Schema
+from geofleet.tables.schemas import DRIVES, LANES, SIGNS, Schema
 from geofleet.tables.store import read_table
 
 if TYPE_CHECKING:
@@ -161,6 +161,20 @@ def read_layer(
             todo=f"It takes {', '.join(f'--{name}'.replace('_', '-') for name in sorted(takes)) or 'no option'}.",
         )
     return layer.reader(schema)(path, **{name: value for name, value in given.items() if name in takes})
+
+
+def read_drives(path: Path) -> LayerRead:
+    """Read a `drives` table of our own, or a trajectory of any format as one.
+
+    Raises
+    ------
+    InputError
+        The file is missing, empty, damaged or of no known format.
+    """
+    if read_head(path).startswith(b"PAR1") and _is_own_table(path):
+        return LayerRead(read_table(DRIVES, path), _OWN)
+    read: LayerRead = import_module("geofleet.formats.drives").read_drive(path)
+    return read
 
 
 def _is_own_table(path: Path) -> bool:

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from geofleet.algorithms.extent import is_within_reach
 from geofleet.algorithms.metrics import MapScore
 from geofleet.errors import ConfigError
-from geofleet.formats.layers import read_layer
+from geofleet.formats.layers import read_drives, read_layer
 from geofleet.formats.results import write_csv, write_result_layers
 from geofleet.tables.certainty import comparison_rows, interval_rows
 from geofleet.tables.manifest import write_manifest
@@ -136,7 +136,7 @@ def evaluate(
     in_view
         Score only reference signs that some pass had in view; the reference must be a `reference` table.
     drive_path
-        A `drives` table: intervals take stretches of road along it.
+        A drive in any format that `read_drives` knows: intervals take stretches of road along it.
     versus_path
         Another map: test whether the first is better, on the same reference.
 
@@ -154,7 +154,7 @@ def evaluate(
     pairs = list(_pairs(map_, reference, clip_m=clip_m))
     matches = _match_pairs(pairs, config)
     scores = score_matches(matches, gate_m=gate_m, match_on=match_on)
-    drive = load_drive(drive_path) if drive_path else None
+    drive = load_drive(read_drives(drive_path).table, drive_path) if drive_path else None
     used, ref_used = _used_rows(pairs, map_.num_rows, reference.num_rows)
     layers = {
         "fused": map_.filter(used),

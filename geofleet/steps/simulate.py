@@ -22,7 +22,7 @@ from geofleet.algorithms.sensing_chain import sense_passes
 from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import track_passes
 from geofleet.errors import ConfigError, InputError
-from geofleet.formats.layers import read_layer
+from geofleet.formats.layers import read_drives, read_layer
 from geofleet.tables.fleets import Fleet, load_fleet, together
 from geofleet.tables.manifest import hash_path, write_manifest
 from geofleet.tables.schemas import DETECTIONS, PASSES, REFERENCE, RUNS, TRUTH
@@ -141,7 +141,7 @@ def simulate(
     Parameters
     ----------
     signs, drive
-        A `signs` and a `drives` table.
+        A layer and a drive in any format that `read_layer` and `read_drives` know.
     out
         Folder to write; an earlier simulation there is replaced.
     config
@@ -160,12 +160,12 @@ def simulate(
     ConfigError
         A number is out of range, or what is asked for cannot be: see `load_fleet`.
     InputError
-        A table cannot be used, no sign is near the drive, the drive does not move, or `out` holds something else.
+        A file cannot be read, no sign is near the drive, the drive does not move, or `out` holds something else.
     """
     numbers = {"n_vehicles": n_vehicles, "n_replicates": n_replicates, "first_replicate": first_replicate}
     _check_numbers(**numbers, seed=seed, n_workers=n_workers)
     _check_out(out)
-    fleet = load_fleet(read_layer(signs).table, drive, source=signs, config=config)
+    fleet = load_fleet(read_layer(signs).table, read_drives(drive).table, source=signs, drive=drive, config=config)
     digest = _digest(config, signs, drive)
     replicates = range(first_replicate, first_replicate + n_replicates)
     run_ids = tuple(_run_id(config.scenario, seed, replicate, digest) for replicate in replicates)
@@ -207,6 +207,7 @@ class _Tally:
         self._scene = fleet.scene
         self._progress, self._total = progress, total
         self._in_view = np.zeros((2, len(fleet.scene.sign_ids)), dtype=np.int64)
+        progress(0, total)
 
     def add(self, output: _BatchOutput) -> None:
         """Count what a batch did; with the last one of a run, keep what its passes had in view, and start anew."""

@@ -143,17 +143,15 @@ def together(passes: Iterable[Pass]) -> list[list[Pass]]:
     return groups
 
 
-def load_fleet(layer: pa.Table, drive: Path, *, source: Path, config: Config) -> Fleet:
+def load_fleet(layer: pa.Table, driven: pa.Table, *, source: Path, drive: Path, config: Config) -> Fleet:
     """Prepare a fleet.
 
     Parameters
     ----------
-    layer
-        A `signs` table.
-    drive
-        A `drives` table.
-    source
-        Where the layer came from, for messages.
+    layer, driven
+        A `signs` and a `drives` table.
+    source, drive
+        Where they came from, for messages.
     config
         The study.
 
@@ -166,7 +164,7 @@ def load_fleet(layer: pa.Table, drive: Path, *, source: Path, config: Config) ->
         The drives cannot be used, do not move or have no times that are asked for, or no sign is near them.
     """
     kinds = _sensor_kinds(config)
-    drives = load_drives(drive) if config.fleet.drives == "all" else (load_drive(drive),)
+    drives = load_drives(driven, drive) if config.fleet.drives == "all" else (load_drive(driven, drive),)
     try:
         ways = tuple(_directions(road, config.fleet) for road in drives)
     except InputError as error:

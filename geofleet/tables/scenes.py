@@ -14,8 +14,8 @@ from geofleet.algorithms.scene import is_repeated, nearest_m, within_corridor
 from geofleet.algorithms.sensing import SignField
 from geofleet.algorithms.trajectory import DriveLine, drive_line
 from geofleet.errors import ConfigError, InputError
-from geofleet.tables.schemas import BBOX, DRIVES, GEOMETRY, SIGNS
-from geofleet.tables.store import lonlat, read_table
+from geofleet.tables.schemas import SIGNS
+from geofleet.tables.store import lonlat
 from geofleet.taxonomy import load_taxonomy
 
 if TYPE_CHECKING:
@@ -49,46 +49,40 @@ class Scene:
     groups: NDArray[np.object_]
 
 
-def load_drive(path: Path) -> Drive:
-    """Read the one drive of a `drives` table.
+def load_drive(table: pa.Table, source: Path) -> Drive:
+    """Return the one drive of a `drives` table that came from `source`, which messages name.
 
     Raises
     ------
     InputError
-        The table cannot be used, holds several drives or none, or the drive does not move.
+        The table holds several drives or none, or the drive does not move.
     """
-    table = _read_drives(path)
     names = pc.unique(table["drive_id"]).to_pylist()
     if len(names) != 1:
         raise InputError(
             f"one drive is needed, found {len(names)}{': ' if names else ''}{', '.join(names[:5])}.",
-            where=str(path),
-            todo='Give a drives table with one drive_id, or set drives = "all".',
+            where=str(source),
+            todo='Give one with a single drive_id, or set drives = "all".',
         )
-    return _drive(table, EnuFrame.around(*lonlat(table)), path)
+    return _drive(table, EnuFrame.around(*lonlat(table)), source)
 
 
-def load_drives(path: Path) -> tuple[Drive, ...]:
-    """Read every drive of a `drives` table, by name, all in one frame.
+def load_drives(table: pa.Table, source: Path) -> tuple[Drive, ...]:
+    """Return every drive of a `drives` table, by name, all in one frame.
 
     Raises
     ------
     InputError
-        The table cannot be used, holds no drive, or one of them does not move.
+        The table holds no drive, or one of them does not move.
     """
-    table = _read_drives(path)
     names = sorted(pc.unique(table["drive_id"]).to_pylist())
     if not names:
-        raise InputError("there is no drive in the table.", where=str(path), todo="Ingest one first.")
+        raise InputError("there is no drive in the table.", where=str(source), todo="Ingest one first.")
     frame = EnuFrame.around(*lonlat(table))
-    return tuple(_drive(table.filter(pc.field("drive_id") == name), frame, path) for name in names)
+    return tuple(_drive(table.filter(pc.field("drive_id") == name), frame, source) for name in names)
 
 
-def _read_drives(path: Path) -> pa.Table:
-    return read_table(DRIVES, path, columns=["drive_id", "seq", "t_utc", "segment", GEOMETRY, BBOX])
-
-
-def _drive(table: pa.Table, frame: EnuFrame, path: Path) -> Drive:
+def _drive(table: pa.Table, frame: EnuFrame, source: Path) -> Drive:
     table = table.sort_by("seq")
     lon, lat = lonlat(table)
     times = None if table["t_utc"].null_count else table["t_utc"].cast(pa.int64()).to_numpy()
@@ -96,7 +90,7 @@ def _drive(table: pa.Table, frame: EnuFrame, path: Path) -> Drive:
     try:
         line = drive_line(frame.to_enu(lon, lat), table["segment"].to_numpy(), elapsed_s)
     except InputError as error:
-        raise InputError(error.what, where=str(path), todo=error.todo) from None
+        raise InputError(error.what, where=str(source), todo=error.todo) from None
     first = table["t_utc"][0].as_py()
     t_start = None if first is None else np.datetime64(first.replace(tzinfo=None), "us")
     return Drive(table["drive_id"][0].as_py(), frame, line, t_start)

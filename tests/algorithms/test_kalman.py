@@ -30,7 +30,7 @@ from geofleet.algorithms.streams import pass_streams
 from geofleet.algorithms.tracking import TrackerModel, track_ideal, track_paper, track_pass
 from geofleet.algorithms.trajectory import Poses
 from geofleet.config import load_config
-from geofleet.formats.layers import read_layer
+from geofleet.formats.layers import read_drives, read_layer
 from geofleet.steps.ingest import ingest_drive, ingest_signs
 from geofleet.tables.fleets import Fleet, load_fleet
 
@@ -54,7 +54,7 @@ def inputs(tmp_path_factory, repo) -> tuple[Path, Path]:
 def fleet_of(inputs: tuple[Path, Path], scenario: str) -> Fleet:
     signs, drive = inputs
     config = load_config(scenario, {"tracker": "kalman"})
-    return load_fleet(read_layer(signs).table, drive, source=signs, config=config)
+    return load_fleet(read_layer(signs).table, read_drives(drive).table, source=signs, drive=drive, config=config)
 
 
 def front_end(fleet: Fleet, tracker, n_passes: int) -> tuple[float, float]:

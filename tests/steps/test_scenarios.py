@@ -146,7 +146,7 @@ def test_placed_signs_keep_their_gap_their_side_and_the_shares_of_real_classes(r
     assert stats.chisquare(counts, np.append(expected[often], expected[~often].sum())).pvalue > 0.001
     for side in ("left", "right"):
         placing.place(drive, signs, per_km=20.0, gap_m=10.0, side=side, like=placing.HELSINKI, seed=3)
-        layer, driven = read_table(SIGNS, signs), load_drive(drive)
+        layer, driven = read_table(SIGNS, signs), load_drive(read_table(DRIVES, drive), drive)
         xy_m = driven.frame.to_enu(*lonlat(layer))
         way = resample(driven.line, spacing_m=1.0, heading_baseline_m=9.0)
         near = np.argmin(np.hypot(*(xy_m[:, None] - way.xy_m).transpose(2, 0, 1)), axis=1)
@@ -163,7 +163,7 @@ def test_city_drives_cover_the_roads_legally_and_have_their_length(repo, script,
     table = read_table(DRIVES, tmp_path / "drives.parquet")
     assert len(set(table["drive_id"].to_pylist())) == 3
     assert set(table["fix_quality"].to_pylist()) == {"derived"}
-    drives = load_drives(tmp_path / "drives.parquet")
+    drives = load_drives(table, tmp_path / "drives.parquet")
     for driven in drives:
         assert driven.line.along_m[-1] == pytest.approx(900, rel=0.05)
     roads = city.connected(city.read_graph(repo / "data" / "raw" / "helsinki.osm.pbf"))

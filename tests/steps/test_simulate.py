@@ -13,6 +13,7 @@ import pytest
 from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.config import Config, load_config
 from geofleet.errors import ConfigError, GeofleetError, InputError
+from geofleet.steps.ingest import ingest_drive
 from geofleet.steps.simulate import SimulateResult, simulate
 from geofleet.tables.manifest import hash_path
 from geofleet.tables.schemas import DETECTIONS, DRIVES, PASSES, REFERENCE, RUNS, SIGNS, TRUTH
@@ -86,7 +87,7 @@ def test_every_table_is_written_with_its_schema(inputs: tuple[Path, Path], tmp_p
     out = tmp_path / "simulation"
     calls: list[tuple[int, int]] = []
     result = run(inputs, out, n_replicates=2, seed=7, progress=lambda done, total: calls.append((done, total)))
-    assert calls == [(k, 8) for k in range(1, 9)]
+    assert calls == [(k, 8) for k in range(9)]
     runs, reference = read_table(RUNS, out / "runs.parquet"), read_table(REFERENCE, out / "reference.parquet")
     passes, detections = read_table(PASSES, out / "passes.parquet"), read_table(DETECTIONS, out / "detections")
     truth = read_table(TRUTH, out / "truth")
@@ -175,6 +176,20 @@ def test_the_run_is_named_after_what_shapes_it(inputs: tuple[Path, Path], tmp_pa
     assert run(inputs, tmp_path / "c", 1, config=config).run_ids == same != other
     odd = config.model_copy(update={"scenario": "my town/50 %"})
     assert run(inputs, tmp_path / "d", 1, config=odd).run_ids[0].startswith("my-town-50---s0-r0-")
+
+
+def test_a_drive_of_any_format_is_driven_as_its_table_is(repo: Path, tmp_path: Path) -> None:
+    raw = repo / "data" / "raw"
+    ingest_drive([raw / "helsinki_derived.pos"], tmp_path / "drives.parquet")
+    for name, drive in (("pos", raw / "helsinki_derived.pos"), ("table", tmp_path / "drives.parquet")):
+        simulate(raw / "helsinki.osm.pbf", drive, tmp_path / name, config=load_config(), n_vehicles=2)
+    of_file, of_table = (
+        read_table(DETECTIONS, tmp_path / name / "detections").drop_columns(["run_id"]) for name in ("pos", "table")
+    )
+    assert of_file.num_rows > 20
+    assert of_file.equals(of_table)
+    with pytest.raises(InputError, match=r"NOTICE\.md: not a trajectory .* Supported are rtklib"):
+        simulate(raw / "helsinki.osm.pbf", raw / "NOTICE.md", tmp_path / "out", config=load_config(), n_vehicles=2)
 
 
 def test_equal_classes_at_one_point_or_on_one_support_count_once(tmp_path: Path) -> None:
