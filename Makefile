@@ -23,7 +23,7 @@ CODE := $(shell find geofleet sql -name '*.py' -o -name '*.sql' -o -name '*.toml
 .PHONY: FORCE help setup demo test check study results environments ingest simulate aggregate evaluate report format bench lock clean
 
 help: ## List the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 setup: $(READY) ## Make the virtual environment .venv from the lock file
 

@@ -18,12 +18,13 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, WrapValidator, model_validator
+from pydantic_core import PydanticCustomError
 
 from geofleet.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -119,6 +120,14 @@ class SensorConfig(_Section):
     declared_sigma_scale: Annotated[Positive, Off(1.0)]
 
 
+def _true_false_or_auto(value: Any, read: Callable[[Any], Any]) -> Any:
+    """Read either; a fault is told once, not once a kind of value."""
+    try:
+        return read(value)
+    except ValidationError:
+        raise PydanticCustomError("true_false_or_auto", "Input should be true, false or auto") from None
+
+
 class TrackingConfig(_Section):
     """How a vehicle turns frames into tracks (paper, "Temporal Tracking and Fusion")."""
 
@@ -131,7 +140,7 @@ class TrackingConfig(_Section):
     track_gate_chi2: Annotated[Positive, Off(13.8)]
     merge_gate_chi2: Annotated[Positive, Off(13.8)]
     class_error_rate: Annotated[float, Field(gt=0, lt=1), Off(0.05)]
-    send_information: Annotated[bool | Literal["auto"], Off("auto")]
+    send_information: Annotated[bool | Literal["auto"], WrapValidator(_true_false_or_auto), Off("auto")]
     split_track_rate: Annotated[Rate, Off(0.0)]
 
     @property

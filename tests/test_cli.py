@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from geofleet.cli import app, main
+from geofleet.cli import app, main, output
 
 RAW = Path(__file__).parent.parent / "data" / "raw"
 PBF, POS = RAW / "helsinki.osm.pbf", RAW / "helsinki_derived.pos"
@@ -206,12 +206,26 @@ def test_schema_of_a_table(tmp_path):
         (("fleet-size", "--scenario", "nowhere"), "unknown scenario"),
         (("plan", "--target", "gospa_m"), "Example: gospa_m=0.5"),
         (("plan", "--target", "f1=0.9", "--method", "dbscan,kmeans"), "one drive, one scenario and one method"),
+        (("plan", "--target", "f1=0.9", "--confidence", "1.5"), "--confidence: the level is 1.5"),
     ],
 )
 def test_a_study_that_cannot_be(arguments, says, tables, tmp_path):
     inputs = ("--signs", tables / "signs.parquet", "--drive", tables / "drives.parquet")
     result = geofleet("study", *arguments, *inputs, "--out", "out", cwd=tmp_path)
     assert_refused(result, says, cwd=tmp_path)
+    assert "..." not in result.stderr, "work was announced before the fault was found"
+
+
+def test_progress_tells_the_time_left_but_not_at_the_end(monkeypatch, capsys):
+    monkeypatch.setattr(output, "_SECONDS_A_LINE", -1)
+    with output.progress_bar("planning") as tell:
+        assert not capsys.readouterr().err
+        for done in (0, 1, 4):
+            tell(done, 4)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "planning ..."
+    assert [line.partition(" after")[0] for line in lines[1:]] == [f"planning: {done} of 4" for done in (0, 1, 4)]
+    assert ["left" in line for line in lines[1:]] == [False, True, False]
 
 
 def test_an_outdated_copy_from_the_command_line(tables, tmp_path):

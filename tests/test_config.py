@@ -60,7 +60,7 @@ def test_digest_changes_with_what_it_covers_only():
         (["groups=[]"], r"scene\.groups: .*at least 1"),
         (["range_m=1e9"], r"sensor\.range_m: .*less than or equal to 10000"),
         (["frame_spacing_m=1e-9"], r"fleet\.frame_spacing_m: .*greater than or equal to 0\.01"),
-        (["send_information=maybe"], r"tracking\.send_information"),
+        (["send_information=maybe"], r"^tracking\.send_information: [^;]* true, false or auto \(got 'maybe'\)\. Corr"),
         (["nothing"], "'nothing' is not key=value"),
     ],
 )

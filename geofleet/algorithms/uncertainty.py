@@ -230,10 +230,10 @@ def direction(score: str) -> Direction:
         raise InputError(f"there is no score {score!r}", todo=f"Give one of {', '.join(BETTER)}.") from None
 
 
-def check_level(level: float) -> None:
-    """Raise InputError unless the level is a share between 0 and 1."""
+def check_level(level: float, where: str = "interval") -> None:
+    """Raise InputError, which names where the level was given, unless it is a share between 0 and 1."""
     if not 0 < level < 1:
-        raise InputError(f"the level is {level}.", where="interval", todo="Give a share between 0 and 1, e.g. 0.95.")
+        raise InputError(f"the level is {level}.", where=where, todo="Give a share between 0 and 1, e.g. 0.95.")
 
 
 def _scores(scores: Sequence[float | None] | Floats) -> Floats:

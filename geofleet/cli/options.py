@@ -42,7 +42,9 @@ CountryOption = Annotated[
 LayerOption = Annotated[str | None, typer.Option("--layer", help="Layer of a GeoPackage, or Shapefile of a zip.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="A TOML file of settings.")]
-Scenario = Annotated[str, typer.Option("--scenario", help="Name of a packaged scenario, or a TOML file.")]
+Scenario = Annotated[
+    str, typer.Option("--scenario", help="Packaged scenario or TOML file: it sets every option that is left out.")
+]
 Settings = Annotated[
     list[str] | None, typer.Option("--set", help="Override any key: --set eps_m=4.0", metavar="KEY=VALUE")
 ]

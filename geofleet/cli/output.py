@@ -24,9 +24,11 @@ _SECONDS_A_LINE = 15
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Draw a progress bar with the time left on a terminal; elsewhere (CI, a pipe) tell it line by line, seldom."""
+    """Draw a progress bar with the time left on a terminal; elsewhere (CI, a pipe) tell it line by line, seldom.
+
+    Nothing is told before the work has begun: what is wrong with the input comes first, and alone.
+    """
     if not sys.stderr.isatty():
-        sys.stderr.write(f"{label} ...\n")
         yield _Lines(label).tell
         return
     from rich.console import Console
@@ -51,9 +53,11 @@ class _Lines:
         now = time.monotonic()
         if self._first is None:
             self._first = done
+            sys.stderr.write(f"{self._label} ...\n")
         if now - self._last >= _SECONDS_A_LINE:
             self._last, fresh = now, done - self._first
-            left = f", about {(now - self._begin) / fresh * (total - done):.0f} s left" if fresh else ""
+            is_known = fresh and done < total  # what follows the last one, drawing and writing, is short
+            left = f", about {(now - self._begin) / fresh * (total - done):.0f} s left" if is_known else ""
             sys.stderr.write(f"{self._label}: {done} of {total} after {now - self._begin:.0f} s{left}\n")
 
 

@@ -25,14 +25,16 @@ app = typer.Typer(rich_markup_mode=None)
 
 @app.command()
 def simulate(
-    signs: Annotated[Path, typer.Option("--signs", help="A signs table.")],
-    drive: Annotated[Path, typer.Option("--drive", help="A drives table.")],
+    signs: Annotated[Path, typer.Option("--signs", help="Signs of any source.")],
+    drive: Annotated[Path, typer.Option("--drive", help="A drive of any format.")],
     out: OutFolder,
     scenario: Scenario = "paper",
     vehicles: Annotated[int, typer.Option("--vehicles", help="Size of the fleet.")] = 50,
     replicates: Annotated[int, typer.Option("--replicates", help="Independent repetitions.")] = 1,
     seed: Annotated[int, typer.Option("--seed", help="Of all random numbers.")] = 0,
-    corridor_m: Annotated[float | None, typer.Option(help="Signs this near to the drive are the scene.")] = None,
+    corridor_m: Annotated[
+        float | None, typer.Option(help="Signs this near to the drive are the scene, metres.")
+    ] = None,
     groups: Annotated[
         str | None, typer.Option(help="Groups of signs in the scene: warning,priority ...", metavar="NAME,...")
     ] = None,
@@ -46,7 +48,7 @@ def simulate(
 ) -> None:
     """Simulate a fleet past real signs. Writes reference, passes, detections and truth.
 
-    Example: geofleet simulate --signs signs.parquet --drive drives.parquet --vehicles 50 --out simulation
+    Example: geofleet simulate --signs city.osm.pbf --drive drive.pos --vehicles 50 --out simulation
     """
     from geofleet.steps import simulate as step
 
@@ -74,12 +76,12 @@ def aggregate(
     vehicles: Annotated[int | None, typer.Option("--vehicles", help="Use the first V vehicles only.")] = None,
     method: Annotated[str | None, typer.Option(help="dbscan, hdbscan, kmeans, kmedoids or joint.")] = None,
     semantic: Annotated[str | None, typer.Option(help="first or after.")] = None,
-    eps_m: Annotated[float | None, typer.Option(help="Radius of a neighbourhood.")] = None,
-    min_samples: Annotated[int | None, typer.Option(help="Detections that make a core.")] = None,
+    eps_m: Annotated[float | None, typer.Option(help="Radius of a neighbourhood, metres: dbscan.")] = None,
+    min_samples: Annotated[int | None, typer.Option(help="Detections that make a core: dbscan.")] = None,
     min_cluster_size: Annotated[int | None, typer.Option(help="Detections that make a cluster: hdbscan.")] = None,
     k: Annotated[int | None, typer.Option("--k", help="Signs of a run: kmeans, kmedoids; 0 = chosen.")] = None,
     k_from: Annotated[Path | None, typer.Option(help="Reference that tells K (an oracle): kmeans, kmedoids.")] = None,
-    min_support: Annotated[int | None, typer.Option(help="Passes that a sign needs.")] = None,
+    min_support: Annotated[int | None, typer.Option(help="Passes that a sign needs: all but joint.")] = None,
     passes: Annotated[Path | None, typer.Option(help="A passes table: who could have seen a place.")] = None,
     prior: Annotated[Path | None, typer.Option(help="An earlier map, any sign source: joint.")] = None,
     explain: Annotated[
@@ -88,7 +90,9 @@ def aggregate(
     correct_bias: Annotated[
         bool | None, typer.Option("--correct-bias", help="Take the bias of each pass out first (information form).")
     ] = None,
-    tile_zoom: Annotated[int | None, typer.Option(help="Size of the tiles; the result does not depend on it.")] = None,
+    tile_zoom: Annotated[
+        int | None, typer.Option(help="Web Mercator zoom of the tiles, 12 to 20; not of the result.")
+    ] = None,
     config: ConfigFile = None,
     scenario: Scenario = "paper",
     settings: Settings = None,
@@ -145,7 +149,7 @@ def evaluate(
     clip: Annotated[bool, typer.Option("--clip", help="Score only where both maps have signs.")] = False,
     clip_m: Annotated[float | None, typer.Option(help="With --clip: as near as this, 100 m if not given.")] = None,
     in_view: Annotated[bool, typer.Option("--in-view", help="Score only signs that a pass had in view.")] = False,
-    drive: Annotated[Path | None, typer.Option("--drive", help="Drives table: intervals go along it.")] = None,
+    drive: Annotated[Path | None, typer.Option("--drive", help="A drive of any format: intervals go along it.")] = None,
     versus: Annotated[Path | None, typer.Option("--versus", help="Another map: is the first one better?")] = None,
     require: Annotated[list[str] | None, typer.Option(help='Exit 1 when missed: "gospa_m<0.8".')] = None,
     config: ConfigFile = None,

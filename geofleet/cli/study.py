@@ -48,10 +48,14 @@ Scenarios = Annotated[str, typer.Option("--scenario", help="Packaged scenarios o
 Methods = Annotated[
     str | None,
     typer.Option(
-        "--methods", help="dbscan, hdbscan, kmeans, kmedoids (-first, -after), dbscan-corrected, joint, joint-prior."
+        "--methods",
+        help="dbscan, hdbscan, kmeans, kmedoids (-first, -after), dbscan-corrected, joint, joint-prior; "
+        "the paper's, dbscan-corrected and joint by default.",
     ),
 ]
-Sizes = Annotated[str | None, typer.Option("--vehicles", help="Fleet sizes.", metavar="V,V,...")]
+Sizes = Annotated[
+    str | None, typer.Option("--vehicles", help="Fleet sizes; those of the paper by default.", metavar="V,V,...")
+]
 Replicates = Annotated[int, typer.Option("--replicates", help="Independent fleets.")]
 Seed = Annotated[int, typer.Option("--seed", help="Of all random numbers.")]
 InView = Annotated[bool, typer.Option("--in-view", help="Score only signs that a pass had in view.")]
@@ -158,7 +162,7 @@ def study_plan(
     out: StudyOut = Path("study"),
     signs: SignsOption = None,
     drive: Annotated[Path | None, typer.Option("--drive", help="A drive of any format; shipped by default.")] = None,
-    scenario: Annotated[str, typer.Option("--scenario", help="Name of a packaged scenario, or a TOML file.")] = "paper",
+    scenario: Annotated[str, typer.Option("--scenario", help="A packaged scenario, or a TOML file.")] = "paper",
     method: Annotated[str, typer.Option("--method", help="As --methods of study compare; one.")] = "dbscan",
     confidence: Annotated[float, typer.Option(help="Of the interval, and the share of fleets to be safe for.")] = 0.95,
     max_passes: Annotated[int, typer.Option(min=1, help="Most passes that are tried.")] = 200,
@@ -176,10 +180,12 @@ def study_plan(
 
     Example: geofleet study plan --target gospa_m=0.5 --signs city.osm.pbf --drive drive.pos --method dbscan-corrected
     """
+    from geofleet.algorithms.uncertainty import check_level
     from geofleet.workflows.study import plan as workflow
     from geofleet.workflows.study.answers import parse_target
 
     goal = parse_target(target)
+    check_level(confidence, "--confidence")
     study = _study(
         *(out, signs, [drive] if drive else None, str(config or scenario)),
         methods=method,

@@ -131,6 +131,7 @@ def plan(
     searches = [_search(study, target, folder, number) for number in range(study.n_replicates)]
     tell = progress or (lambda _done, _total: None)
     missing = [search for search in searches if not search.path.is_file()]
+    tell(len(searches) - len(missing), len(searches))
     for _ in run_all(run_search, missing, n_workers=n_workers):
         tell(sum(search.path.is_file() for search in searches), len(searches))
     fleets = [json.loads(search.path.read_text(encoding="utf-8")) for search in searches]

@@ -101,6 +101,7 @@ def run_study(study: Study, folder: Path, *, n_workers: int = 1, progress: Progr
     worlds = [_world(study, world, units_dir) for world in study.worlds]
     every = [unit for world in worlds for unit in world.units]
     tell = progress or (lambda _done, _total: None)
+    tell(sum(unit.path.is_file() for unit in every), len(every))
     size = math.ceil(study.n_replicates / max(n_workers, 1))
     for _ in run_all(run_batch, [batch for world in worlds for batch in _missing(world, size)], n_workers=n_workers):
         tell(sum(unit.path.is_file() for unit in every), len(every))
