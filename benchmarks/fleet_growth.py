@@ -1,7 +1,7 @@
-"""Does F1 hold as passes grow to 2,000? The demo scene, DBSCAN's core rule fixed and following the passes.
+"""Does F1 hold as passes grow to 2,000? The demo scene, DBSCAN's core rule fixed and following the densest place.
 
     python benchmarks/fleet_growth.py --seed 11 --replicates 10
-    python benchmarks/fleet_growth.py --seed 11 --replicates 10 --set min_samples_free_passes=20 --shares 0.5
+    python benchmarks/fleet_growth.py --seed 12 --replicates 10 --drive data/raw/helsinki_derived_b.pos
 
 Means over replicates. `step` is the mean change of F1 from the size before, replicate by replicate, with its standard
 error: a fleet of 50 is the first 50 vehicles of the fleet of 100, so that the sizes share their luck.
@@ -34,8 +34,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="paper")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--sizes", nargs="+", type=int, default=[20, 50, 100, 200, 2000])
-    parser.add_argument("--shares", nargs="+", type=float, default=[0.0, 0.2, 0.35, 0.5])
+    parser.add_argument("--sizes", nargs="+", type=int, default=[20, 50, 100, 200, 500, 2000])
+    parser.add_argument("--shares", nargs="+", type=float, default=[0.0, 0.8])
     parser.add_argument("--replicates", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=Path, default=RAW / "helsinki_derived.pos")

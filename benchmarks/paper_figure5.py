@@ -3,6 +3,7 @@
     python benchmarks/paper_figure5.py --scenario paper --seed 1 --replicates 24
     python benchmarks/paper_figure5.py --drive data/raw/helsinki_derived_b.pos --in-view
 
+The map is that of `dbscan-first` in a study: plain DBSCAN, as the paper has it (`min_samples_share` 0).
 Detections are simulated; signs and roads are real (© OpenStreetMap contributors, ODbL), the drives derived.
 """
 
@@ -23,6 +24,8 @@ from geofleet.steps.ingest import ingest_drive, ingest_signs
 from geofleet.steps.simulate import simulate
 from geofleet.tables.schemas import REFERENCE, SIGNS
 from geofleet.tables.store import atomic_path, read_table, write_table
+from geofleet.workflows.study.fleet_size import PAPER_METHOD
+from geofleet.workflows.study.methods import METHODS, with_settings
 from geofleet.workflows.study.paper import paper_curve
 
 RAW = Path(__file__).parent.parent / "data" / "raw"
@@ -34,7 +37,7 @@ BLOCK = 10
 
 def scores(folder: Path, args: argparse.Namespace, replicates: range) -> list[dict[str, object]]:
     """Simulate some replicates once and return the totals of every fleet size."""
-    config = load_config(args.scenario, args.set)
+    config = with_settings(load_config(args.scenario, args.set), METHODS[PAPER_METHOD])
     ingest_signs([RAW / "helsinki.osm.pbf"], folder / "signs.parquet")
     ingest_drive([args.drive], folder / "drives.parquet")
     simulation = folder / "simulation"

@@ -157,7 +157,6 @@ class AggregateConfig(_Section):
     eps_m: Positive
     min_samples: Annotated[int, Field(ge=1)]
     min_samples_share: Rate
-    min_samples_free_passes: Annotated[int, Field(ge=0), Off(50)]
     min_cluster_size: Annotated[int, Field(ge=2)]
     k: Annotated[int, Field(ge=0)]
     max_k: Annotated[int, Field(ge=1)]

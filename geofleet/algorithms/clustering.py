@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 # within 25 km, so that two points of one cell are always within eps.
 _CELL_SLACK = 1e-5
 _MAX_KEY_BITS = 62
+PEAK_SIGMAS = 2.0  # by which a count may fall short of its share of the largest one by chance
 _PLANE = 2
 
 
@@ -86,7 +87,7 @@ def dbscan_groups(
     groups: ArrayLike,
     *,
     eps_m: float,
-    min_samples: int | Ints,
+    min_samples: int,
     ecef_m: Floats | None = None,
 ) -> Clusters:
     """Cluster points within groups (classes, tiles, runs) in one pass: no cluster spans two groups.
@@ -97,10 +98,8 @@ def dbscan_groups(
         (n, 2) east and north, metres. Each group may use a frame of its own.
     groups
         (n,) integers from 0.
-    eps_m
+    eps_m, min_samples
         As for `dbscan`.
-    min_samples
-        As for `dbscan`, or (n_groups,) one for each group.
     ecef_m
         (n, 3) Earth-centred coordinates, metres. When given, distances are taken between these and `xy` only says
         where to look for neighbours; it must be a tangent plane with its origin within 25 km.
@@ -113,18 +112,53 @@ def dbscan_groups(
     points, codes = _checked(xy), np.ascontiguousarray(groups, np.int64)
     if not (math.isfinite(eps_m) and eps_m > 0):
         raise InputError(f"eps_m is {eps_m}.", where="dbscan", todo="Give a positive finite distance, e.g. 4.0.")
-    if np.min(min_samples, initial=1) < 1:
-        raise InputError(f"min_samples is {np.min(min_samples)}.", where="dbscan", todo="Give 1 or more, e.g. 3.")
+    if min_samples < 1:
+        raise InputError(f"min_samples is {min_samples}.", where="dbscan", todo="Give 1 or more, e.g. 3.")
     if len(points) == 0:
         nothing = np.empty(0, np.int64)
         return Clusters(nothing, np.empty(0, np.bool_), nothing, nothing)
     cells = _sort_into_cells(points, codes, points if ecef_m is None else ecef_m, eps_m)
     sq_eps = eps_m * eps_m
-    of_group = np.asarray(min_samples, np.int64)
-    of_group = of_group if of_group.ndim else np.full(int(codes.max()) + 1, of_group)
-    core = kernels.find_cores(cells, sq_eps, of_group[codes[cells.order[cells.first[:-1]]]])
+    core = kernels.find_cores(cells, sq_eps, min_samples)
     cluster = kernels.number_clusters(cells, core, sq_eps)
     return Clusters(*kernels.label_points(cells, core, cluster, sq_eps))
+
+
+def core_counts(peak: Ints, min_samples: int, share: float) -> Ints:
+    """Return how many neighbours make a core where the densest place has `peak`: see `split_groups`."""
+    return np.maximum(min_samples, np.ceil(share * peak - PEAK_SIGMAS * np.sqrt(peak))).astype(np.int64)
+
+
+def split_groups(
+    xy: ArrayLike, groups: ArrayLike, *, eps_m: float, min_samples: int, share: float, ecef_m: Floats | None = None
+) -> Ints:
+    """Cluster the points of each group anew with a core rule that follows its densest place.
+
+    Where a point of the group has M neighbours within eps_m and none has more, a core has
+    max(min_samples, share M - 2 √M): a count of M varies by √M, so of few points hardly anything is asked.
+
+    Parameters
+    ----------
+    xy, groups, ecef_m
+        As for `dbscan_groups`; the groups are clusters of it, and none is empty.
+    eps_m, min_samples
+        Those of the clusters.
+    share
+        Of the largest count, 0 … 1.
+
+    Returns
+    -------
+    (n,) numbers of the new clusters, -1 for noise; a group in which min_samples still make a core stays as it is.
+    """
+    points, codes = _checked(xy), np.ascontiguousarray(groups, np.int64)
+    cells = _sort_into_cells(points, codes, points if ecef_m is None else ecef_m, eps_m)
+    sq_eps = eps_m * eps_m
+    counts = kernels.count_neighbours(cells, sq_eps)
+    starts = np.flatnonzero(np.diff(codes[cells.order], prepend=-1))
+    least = core_counts(np.maximum.reduceat(counts, starts), min_samples, share)
+    core = counts >= np.repeat(least, np.diff(np.append(starts, len(points))))
+    labels, *_ = kernels.label_points(cells, core, kernels.number_clusters(cells, core, sq_eps), sq_eps)
+    return np.where(least[codes] > min_samples, labels, labels.max() + 1 + codes)
 
 
 def _checked(xy: ArrayLike) -> Floats:

@@ -120,17 +120,34 @@ def _has_neighbours(cells: Cells, cell: int, i: int, sq_eps: float, min_samples:
 
 
 @kernel
-def find_cores(cells: Cells, sq_eps: float, min_samples: Ints) -> Flags:
-    """Return which points, in cell order, have the min_samples of their cell within eps, themselves included."""
+def find_cores(cells: Cells, sq_eps: float, min_samples: int) -> Flags:
+    """Return which points, in cell order, have min_samples within eps, themselves included."""
     core = np.zeros(cells.order.size, np.bool_)
     for cell in range(cells.first.size - 1):
         a, b = cells.first[cell], cells.first[cell + 1]
-        if b - a >= min_samples[cell]:
+        if b - a >= min_samples:
             core[a:b] = True
         else:
             for i in range(a, b):
-                core[i] = _has_neighbours(cells, cell, i, sq_eps, min_samples[cell])
+                core[i] = _has_neighbours(cells, cell, i, sq_eps, min_samples)
     return core
+
+
+@kernel
+def count_neighbours(cells: Cells, sq_eps: float) -> Ints:
+    """Return how many points, in cell order, each has within eps, itself included."""
+    n = np.empty(cells.order.size, np.int64)
+    for cell in range(cells.first.size - 1):
+        n[cells.first[cell] : cells.first[cell + 1]] = cells.first[cell + 1] - cells.first[cell]
+    for cell in range(cells.first.size - 1):
+        for row in range(REACH, N_ROWS):  # rows above: every pair of cells is seen once
+            for other in range(max(cells.window[cell, row, 0], cell + 1), cells.window[cell, row, 1]):
+                for i in range(cells.first[cell], cells.first[cell + 1]):
+                    for j in range(cells.first[other], cells.first[other + 1]):
+                        if _sq_distance(cells.coords, i, j) <= sq_eps:
+                            n[i] += 1
+                            n[j] += 1
+    return n
 
 
 @kernel

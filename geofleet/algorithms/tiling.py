@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geofleet.algorithms.clustering import dbscan_groups
+from geofleet.algorithms.clustering import core_counts, dbscan_groups, split_groups
 from geofleet.algorithms.clustering_kernels import join_parts
 from geofleet.algorithms.geodesy_kernels import ecef_points, local_axes, tile_planes
 from geofleet.errors import InputError
@@ -199,52 +199,44 @@ def join_open(point: Ints, cluster: Ints, is_core: Flags, is_owned: Flags) -> tu
 
 
 def split_chains(
-    lon_deg: Floats,
-    lat_deg: Floats,
-    cluster: Ints,
-    pass_code: Ints,
-    *,
-    eps_m: float,
-    min_samples: int,
-    share: float,
-    free_passes: int,
+    lon_deg: Floats, lat_deg: Floats, cluster: Ints, *, eps_m: float, min_samples: int, share: float
 ) -> Ints:
-    """Cluster the members of each cluster anew with a core rule that follows the passes behind it.
+    """Cluster the members of each cluster anew with a core rule that follows its densest place.
 
     The more passes, the more far-out detections: with a fixed core rule three of them bridge two signs of a class, and
-    clusters grow into chains as fleets do. A sign has a place that most of its passes agree on within eps; what lies
-    between two signs has not. So a cluster of P passes is clustered again, by itself, with
-    max(min_samples, share (P - free_passes)) for a core; what is left over is noise. Some passes are free: a count of a
-    few says little, and the rule sets in without a step. A cluster is known whole by then, so that tiles do not
-    show in this either.
+    clusters grow into chains as fleets do. Around a sign detections are dense and between two signs they are not, so a
+    cluster is clustered again, by itself, with a core rule relative to its densest place (`clustering.split_groups`);
+    what is left over is noise. It asks for no scale of the errors and no size of the fleet. A cluster is known whole by
+    then, so that tiles do not show in this either.
 
     Parameters
     ----------
-    lon_deg, lat_deg, pass_code
+    lon_deg, lat_deg
         (n,) members, sorted by cluster, pass and track.
     cluster
         (n,) their clusters.
     eps_m, min_samples
         Those of the clusters.
-    share, free_passes
-        Share of the passes of a cluster beyond `free_passes` that make a core, 0 … 1.
+    share
+        Share of the detections within eps_m of the densest place that make a core, 0 … 1.
 
     Returns
     -------
     (n,) clusters numbered anew, -1 for noise; `cluster` itself where none has a core rule of its own.
     """
-    is_first = np.append(True, np.diff(cluster) != 0)
-    group = np.cumsum(is_first) - 1
-    is_pass = is_first | np.append(True, np.diff(pass_code) != 0)
-    n_passes = np.bincount(group[is_pass])
-    least = np.maximum(min_samples, np.ceil(share * np.maximum(n_passes - free_passes, 0))).astype(np.int64)
-    again = least[group] > min_samples
+    lead = np.flatnonzero(np.append(True, np.diff(cluster) != 0))
+    size = np.diff(np.append(lead, cluster.size))
+    may_split = core_counts(size, min_samples, share) > min_samples  # no place has more than all
+    again = np.repeat(may_split, size)
     if not again.any():
         return cluster
-    lon0, lat0 = lon_deg[is_first], lat_deg[is_first]
+    lead = lead[may_split]
+    group = np.repeat(np.arange(lead.size), size[may_split])
     ecef = ecef_points(lon_deg[again], lat_deg[again])
-    plane = tile_planes(ecef, group[again], ecef_points(lon0, lat0), local_axes(lon0, lat0))
-    found = dbscan_groups(plane, group[again], eps_m=eps_m, min_samples=least, ecef_m=ecef)
-    split = group.copy()
-    split[again] = np.where(found.labels < 0, -1, found.labels + len(n_passes))
+    plane = tile_planes(
+        ecef, group, ecef_points(lon_deg[lead], lat_deg[lead]), local_axes(lon_deg[lead], lat_deg[lead])
+    )
+    found = split_groups(plane, group, eps_m=eps_m, min_samples=min_samples, share=share, ecef_m=ecef)
+    split = np.repeat(np.arange(size.size), size)
+    split[again] = np.where(found < 0, -1, found + size.size)
     return split

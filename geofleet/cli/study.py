@@ -49,8 +49,8 @@ Methods = Annotated[
     str | None,
     typer.Option(
         "--methods",
-        help="dbscan, hdbscan, kmeans, kmedoids (-first, -after), dbscan-corrected, joint, joint-prior; "
-        "the paper's, dbscan-corrected and joint by default.",
+        help="dbscan, hdbscan, kmeans, kmedoids (-first, -after), dbscan-peaks, dbscan-corrected, joint, joint-prior; "
+        "the paper's, dbscan-peaks, dbscan-corrected and joint by default.",
     ),
 ]
 Sizes = Annotated[

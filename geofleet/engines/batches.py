@@ -53,7 +53,6 @@ class TileTask:
     eps_m: float
     min_samples: int
     min_samples_share: float
-    min_samples_free_passes: int
     semantic: str
 
 
@@ -95,7 +94,6 @@ def splitter(task: TileTask) -> Splitter:
         eps_m=task.eps_m,
         min_samples=task.min_samples,
         share=task.min_samples_share,
-        free_passes=task.min_samples_free_passes,
     )
 
 
@@ -148,7 +146,7 @@ def fuse_members(
     taken, cluster = member[order], cluster[order]
     rows = {name: values[taken] for name, values in rows.items() if name in _FUSED}
     if splitter:
-        split = splitter(rows["lon"], rows["lat"], cluster, rows["pass_code"])
+        split = splitter(rows["lon"], rows["lat"], cluster)
         if split is not cluster:
             kept = np.flatnonzero(split >= 0)
             kept = kept[radix_argsort(split[kept], np.arange(kept.size))]  # stable: in a cluster they stay by key

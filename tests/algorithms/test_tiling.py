@@ -243,42 +243,71 @@ def test_colliding_ids_are_told_apart():
 
 
 def chain(rng, n_passes, gap_m=13.0):
-    """Two signs of a class whose far-out detections meet between them."""
+    """Two signs of a class whose far-out detections meet between them, in any order."""
     xy = np.concatenate([rng.normal((at, 0), 1.7, (n_passes, 2)) for at in (0.0, gap_m)])
-    lon, lat = EnuFrame(24.9, 60.2).to_lonlat(xy)
-    pass_code = np.tile(np.arange(n_passes), 2)
-    order = np.argsort(pass_code, kind="stable")
-    return xy[order], lon[order], lat[order], pass_code[order]
+    xy = xy[rng.permutation(len(xy))]
+    return xy, *EnuFrame(24.9, 60.2).to_lonlat(xy)
 
 
-def test_a_core_rule_that_follows_the_passes_splits_what_a_fixed_one_chains():
-    xy, lon, lat, pass_code = chain(np.random.default_rng(0), 600)
+def same_groups(labels, others):
+    """Whether two labellings have the same noise and the same groups."""
+    is_noise_same = np.array_equal(labels < 0, others < 0)
+    n_pairs = len(np.unique(np.column_stack((labels, others)), axis=0))
+    return is_noise_same and n_pairs == len(np.unique(labels)) == len(np.unique(others))
+
+
+def largest_count(xy, eps_m):
+    return int((np.linalg.norm(xy[:, None] - xy[None], axis=2) <= eps_m).sum(axis=1).max())
+
+
+@pytest.mark.parametrize(("n_passes", "gap_m"), [(600, 13.0), (60, 12.0)])
+def test_a_core_rule_that_follows_the_densest_place_splits_what_a_fixed_one_chains(n_passes, gap_m):
+    xy, lon, lat = chain(np.random.default_rng(0), n_passes, gap_m)
     assert dbscan(xy, 4.0, 3).max() == 0  # one chain
+    split = split_chains(lon, lat, np.zeros(len(lon), np.int64), eps_m=4.0, min_samples=3, share=0.8)
+    most = largest_count(xy, 4.0)
+    assert same_groups(split, dbscan(xy, 4.0, math.ceil(0.8 * most - 2 * math.sqrt(most))))
+    first, second = (xy[split == label, 0] for label in np.unique(split[split >= 0]))
+    assert sorted((round(first.mean() / gap_m, 1), round(second.mean() / gap_m, 1))) == [0.0, 1.0]
+
+
+def test_the_rule_has_no_scale():
+    """Errors three times as large, eps with them: the same groups."""
+    xy, lon, lat = chain(np.random.default_rng(1), 200)
+    wide_lon, wide_lat = EnuFrame(24.9, 60.2).to_lonlat(3 * xy)
     one = np.zeros(len(lon), np.int64)
-    split = split_chains(lon, lat, one, pass_code, eps_m=4.0, min_samples=3, share=0.5, free_passes=50)
-    assert set(split.tolist()) - {-1} == {1, 2}
-    for label in (1, 2):
-        assert len(set((xy[split == label, 0] > 6.5).tolist())) == 1  # all of it on one side
-    expected = dbscan(xy, 4.0, 275)  # half of the 550 passes beyond the first fifty
-    assert ((split < 0) == (expected < 0)).all()
-    assert len(np.unique(np.column_stack((split, expected)), axis=0)) == len(np.unique(split))
+    split = split_chains(lon, lat, one, eps_m=4.0, min_samples=3, share=0.8)
+    assert same_groups(split, split_chains(wide_lon, wide_lat, one, eps_m=12.0, min_samples=3, share=0.8))
 
 
-def test_few_passes_leave_clusters_as_they_are():
-    _, lon, lat, pass_code = chain(np.random.default_rng(0), 56)  # 3 is half of those beyond fifty
-    clusters = np.full(2 * 56, 4)
-    assert split_chains(lon, lat, clusters, pass_code, eps_m=4.0, min_samples=3, share=0.5, free_passes=50) is clusters
-    assert (
-        split_chains(lon, lat, clusters, pass_code, eps_m=4.0, min_samples=2, share=0.5, free_passes=50) is not clusters
-    )
-
-
-def test_the_fewer_passes_are_free_the_sooner_the_rule_sets_in():
-    xy, lon, lat, pass_code = chain(np.random.default_rng(0), 56)
+def test_a_wide_sign_stays_one():
+    """Few of its passes agree within eps, which no sign between two is to be told from; it is not taken for noise."""
+    xy = np.random.default_rng(2).normal(0, 5.0, (400, 2))
     split = split_chains(
-        *(lon, lat, np.zeros(len(lon), np.int64), pass_code), eps_m=4.0, min_samples=3, share=0.5, free_passes=20
+        *EnuFrame(24.9, 60.2).to_lonlat(xy), np.zeros(400, np.int64), eps_m=4.0, min_samples=3, share=0.8
     )
-    expected = dbscan(xy, 4.0, 18)
-    assert expected.max() == 1
-    assert np.array_equal(split < 0, expected < 0)
-    assert len(np.unique(np.column_stack((split, expected)), axis=0)) == len(np.unique(split))
+    assert split.max() == split[split >= 0].min()
+    assert (split >= 0).mean() > 0.5
+
+
+def test_few_detections_leave_clusters_as_they_are():
+    _, lon, lat = chain(np.random.default_rng(0), 6)  # 12 members: at most ceil(9.6 - 6.9) = 3 make a core
+    clusters = np.full(12, 4)
+    assert split_chains(lon, lat, clusters, eps_m=4.0, min_samples=3, share=0.8) is clusters
+    _, lon, lat = chain(np.random.default_rng(0), 600)
+    clusters = np.full(1200, 4)
+    assert split_chains(lon, lat, clusters, eps_m=4.0, min_samples=3, share=0.0) is clusters
+
+
+def test_only_clusters_with_many_detections_in_one_place_are_split():
+    """A long chain of few a place stays whole beside one that falls apart."""
+    xy, lon, lat = chain(np.random.default_rng(0), 300)
+    along = np.column_stack((np.arange(0, 200, 2.0), np.full(100, 500.0)))  # five within eps of each
+    more_lon, more_lat = EnuFrame(24.9, 60.2).to_lonlat(along)
+    cluster = np.repeat([3, 7], [len(xy), len(along)])
+    split = split_chains(
+        np.append(lon, more_lon), np.append(lat, more_lat), cluster, eps_m=4.0, min_samples=3, share=0.8
+    )
+    assert len(set(split[len(xy) :].tolist())) == 1
+    assert len(set(split[: len(xy)].tolist()) - {-1}) == 2
+    assert not set(split[: len(xy)].tolist()) & set(split[len(xy) :].tolist())

@@ -87,7 +87,6 @@ def _tile_tasks(staged: Staged, settings: AggregateConfig) -> list[TileTask]:
             eps_m=settings.eps_m,
             min_samples=settings.min_samples,
             min_samples_share=settings.min_samples_share,
-            min_samples_free_passes=settings.min_samples_free_passes,
             semantic=settings.semantic,
         )
         for number, start, stop in zip(numbers.tolist(), starts.tolist(), stops.tolist(), strict=True)

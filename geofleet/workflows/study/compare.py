@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from geofleet.formats.palette import BLACK, SERIES
 from geofleet.formats.study_figures import NAMES, draw_curves, draw_paper, figure_file
-from geofleet.workflows.study.methods import CORRECTED, JOINT, TABLE_2, default_methods
+from geofleet.workflows.study.methods import CORRECTED, JOINT, PEAKS, TABLE_2, default_methods
 from geofleet.workflows.study.paper import paper_curve, paper_table
 from geofleet.workflows.study.results import GROUP, find, write_study
 from geofleet.workflows.study.units import run_study
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     Rows = Sequence[Mapping[str, Any]]
 
-DEFAULT_METHODS = default_methods(*TABLE_2, CORRECTED, JOINT)
+DEFAULT_METHODS = default_methods(*TABLE_2, PEAKS, CORRECTED, JOINT)
 DEFAULT_SIZES = (50,)
 SHOWN = ("precision", "recall", "f1", "gospa_m")
 

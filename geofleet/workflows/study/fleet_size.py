@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from geofleet.formats.palette import SERIES
 from geofleet.formats.study_figures import NAMES, draw_curves, draw_paper, figure_file
 from geofleet.workflows.study.compare import BARS, describe
-from geofleet.workflows.study.methods import CORRECTED, JOINT, default_methods
+from geofleet.workflows.study.methods import CORRECTED, JOINT, PEAKS, default_methods
 from geofleet.workflows.study.paper import paper_curve
 from geofleet.workflows.study.results import find, write_study
 from geofleet.workflows.study.units import run_study
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 DEFAULT_SIZES = tuple(range(5, 51, 5))
 PAPER_METHOD = "dbscan-first"
-DEFAULT_METHODS = default_methods(PAPER_METHOD, CORRECTED, JOINT)
+DEFAULT_METHODS = default_methods(PAPER_METHOD, PEAKS, CORRECTED, JOINT)
 
 
 @dataclass(frozen=True, slots=True)

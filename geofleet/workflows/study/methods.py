@@ -19,7 +19,9 @@ Upload = Literal["mean", "information"]
 
 CLUSTERING = ("dbscan", "hdbscan", "kmeans", "kmedoids")
 TABLE_2 = tuple(f"{name}-{order}" for name in CLUSTERING for order in ("first", "after"))
-CORRECTED, JOINT, JOINT_PRIOR = "dbscan-corrected", "joint", "joint-prior"
+PEAKS, CORRECTED, JOINT, JOINT_PRIOR = "dbscan-peaks", "dbscan-corrected", "joint", "joint-prior"
+PLAIN = {"min_samples_share": 0.0}
+"""DBSCAN as the paper ran it: one core rule for all fleets. `geofleet aggregate` splits chains instead (PEAKS)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +55,14 @@ class Method:
 def _methods() -> dict[str, Method]:
     methods = {
         f"{name}-{order}": Method(
-            f"{name}-{order}", {"method": name, "semantic": order}, has_oracle_k=name.startswith("km")
+            f"{name}-{order}", {"method": name, "semantic": order} | PLAIN, has_oracle_k=name.startswith("km")
         )
         for name in CLUSTERING
         for order in ("first", "after")
     }
-    corrected: dict[str, Any] = {"method": "dbscan", "semantic": "first", "correct_bias": True}
-    methods[CORRECTED] = Method(CORRECTED, corrected, "information")
+    peaks: dict[str, Any] = {"method": "dbscan", "semantic": "first"}
+    methods[PEAKS] = Method(PEAKS, peaks)
+    methods[CORRECTED] = Method(CORRECTED, peaks | {"correct_bias": True}, "information")
     if JOINT not in get_args(AggregateConfig.model_fields["method"].annotation):
         return methods
     methods[JOINT] = Method(JOINT, {"method": "joint"}, "information", has_passes=True)
