@@ -20,7 +20,7 @@ SEED ?= 0
 FLEETS ?= 10
 CODE := $(shell find geofleet sql -name '*.py' -o -name '*.sql' -o -name '*.toml' -o -name '*.csv' -o -name '*.html' 2>/dev/null)
 
-.PHONY: FORCE help setup demo test check study results environments ingest simulate aggregate evaluate report format bench lock clean
+.PHONY: FORCE help setup demo test check study results fusion-table environments ingest simulate aggregate evaluate report format bench lock clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -105,6 +105,14 @@ $(STUDY)/sweep-semantic_rate/_manifest.json: $(STUDY)/fleet-size/_manifest.json
 
 environments: | $(READY) ## Urban, highway, rural and mixed fleets (the maps are in ../shared/data)
 	$(BIN)/python scripts/study_environments.py --out $(STUDY)
+
+FUSION := $(P)/fusion-study
+fusion-table: | $(READY) ## Joint fusion beside DBSCAN by fleet size, on both drives, into docs/fusion-results.md
+	$(GEOFLEET) study compare --methods dbscan,dbscan-corrected,joint --vehicles 1,2,3,5,8,10,15,20,30,50 \
+	  --scenario paper-ideal,paper,paper-50m --tracker kalman --in-view --replicates 10 \
+	  --drive data/raw/helsinki_derived.pos --drive data/raw/helsinki_derived_b.pos --out $(FUSION)
+	$(BIN)/python benchmarks/joint.py table --study $(FUSION)
+	$(BIN)/python benchmarks/joint_report.py
 
 results: study ## Write docs/results.md from what the studies found
 	$(BIN)/python scripts/write_results.py $(STUDY)

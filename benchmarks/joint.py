@@ -1,7 +1,9 @@
 """Measure joint fusion beside DBSCAN, the known association and the Cramér-Rao bound, on simulated fleets.
 
     .venv/bin/python benchmarks/joint.py bars --drive A --replicates 200
+    .venv/bin/python benchmarks/joint.py bars --drive B --seed 7 --replicates 20      (a seed nobody looked at)
     .venv/bin/python benchmarks/joint.py prior | robustness | cost
+    make fusion-table                                                (`study compare`, then `joint.py table`)
     .venv/bin/python benchmarks/joint_report.py                      (docs/fusion-results.md and its figures)
 
 Every command adds its figures to `benchmarks/results/joint.json`; fleets are simulated once, into `--fleets`.
@@ -10,7 +12,9 @@ Every command adds its figures to `benchmarks/results/joint.json`; fleets are si
 from __future__ import annotations
 
 import argparse
+import csv
 import json
+import pickle
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from joint_cases import PRIOR_CASES, ROBUSTNESS
 from joint_cost import measure_cost
-from joint_fleets import Case, runs, simulated
+from joint_fleets import DRIVE_FILES, SEED, Case, runs, simulated
 from joint_honesty import Honesty, covered
 from joint_maps import (
     dbscan,
@@ -31,19 +35,23 @@ from joint_maps import (
     without_common_offset,
 )
 
+from geofleet.workflows.study.worlds import code_digest
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from geofleet.algorithms.metrics import MapScore
 
 RESULTS = Path(__file__).parent / "results/joint.json"
-VEHICLES = (1, 2, 3, 5, 8, 10, 20, 50)
+VEHICLES = (1, 2, 3, 5, 8, 10, 15, 20, 30, 50)
 KALMAN = {"tracker": "kalman"}
 WITH_PRIOR = (1, 3, 50)
 """Fleets that are also given a stale prior."""
 N_PLAIN = 20
 """Replicates of DBSCAN on plain means: the rival is the corrected one."""
 N_BOOTSTRAP = 2000
+RIVALS = {"dbscan": "dbscan-first", "dbscan by default": "dbscan-peaks", "dbscan corrected": "dbscan-corrected"}
+"""DBSCAN as the paper has it, and with a core rule that follows the fleet, without and with biases taken out."""
 NO_MATCH_M = 99.0
 """Stands for GOSPA_M where nothing matches, in medians."""
 
@@ -82,8 +90,9 @@ class Table(dict[str, Scores]):
     def summary(self) -> dict[str, dict[str, float]]:
         """Return the figures of every method."""
         found: dict[str, dict[str, float]] = {method: scores.summary() for method, scores in self.items()}
-        if "dbscan corrected" in self:
-            found["paired"] = paired(self["joint"], self["dbscan corrected"])
+        for rival in RIVALS:
+            if rival in self:
+                found["paired"] = paired(self["joint"], self[rival])
         return found
 
 
@@ -95,22 +104,25 @@ def paired(ours: Scores, theirs: Scores) -> dict[str, float]:
     low, high = np.quantile(drawn[:, 0] - drawn[:, 1], [0.025, 0.975])
     of_ours, of_theirs = np.median(both, axis=0)
     won = float((both[:, 0] < both[:, 1]).mean())
-    return {"n": n, "joint": of_ours, "dbscan corrected": of_theirs, "low": low, "high": high, "won": won}
+    return {"n": n, "joint": of_ours, "rival": of_theirs, "low": low, "high": high, "won": won}
 
 
 def bars(
     fleets: Path, case: Case, n_replicates: int, n_dbscan: int, vehicles: tuple[int, ...]
 ) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Score every method at every fleet size; and how honest joint fusion is about its errors. A batch at a time."""
-    honesty = {v: Honesty() for v in vehicles}
-    tables: dict[int, Table] = {v: Table() for v in vehicles}
-    unsettled = dict.fromkeys(vehicles, 0)
-    for number, whole in enumerate(runs(fleets, case, n_replicates)):
+    """Score every method at every fleet size; and how honest joint fusion is about its errors. A batch at a time.
+
+    What a batch found is kept beside the fleets: a run that was stopped goes on, with the same program.
+    """
+    sizes = "-".join(map(str, vehicles))
+    kept = fleets / f"bars-{case.name}-{n_dbscan}-{sizes}-{code_digest()}.pickle"
+    done, tables, honesty, unsettled = _begun(kept, vehicles)
+    for number, whole in runs(fleets, case, n_replicates, first=done):
         if number < n_dbscan and number % case.batch == 0:
             at = simulated(fleets, case, number)
             informed = case.settings.get("tracker") == "kalman"  # the fair rival where tracks tell their bias
-            ways = ((False,) if number < N_PLAIN else ()) + ((True,) if informed else ())
-            maps = {(v, way): dbscan(at, case, v, corrected=way) for v in vehicles for way in ways}
+            ways = (("dbscan",) if number < N_PLAIN else ()) + (("dbscan corrected",) if informed else ())
+            maps = {(v, way): dbscan(at, case, v, RIVALS[way]) for v in vehicles for way in ways}
         for v in vehicles:
             run = whole.first_vehicles(v)
             fused = joint(run)
@@ -121,18 +133,28 @@ def bars(
             tables[v].add("known, no common offset", without_common_offset(run, best))
             honesty[v].add(run, fused, best)
             if v in WITH_PRIOR:
-                prior, judged = stale_prior(run, whole.in_view, seed=number)
+                prior, judged = stale_prior(run, whole.in_view, seed=case.seed + number)
                 tables[v].add("joint with a stale prior", score_joint(judged, joint(run, prior)))
                 tables[v].add("stale prior alone", score_prior(judged, prior))
             if number < n_dbscan:
-                for (size, corrected), found in maps.items():
+                for (size, way), found in maps.items():
                     if size == v:
-                        tables[v].add("dbscan corrected" if corrected else "dbscan", score_dbscan(run, found))
+                        tables[v].add(way, score_dbscan(run, found))
         if (number + 1) % case.batch == 0:
             for v in vehicles:
                 print(number + 1, v, _short(tables[v].summary()), unsettled[v], flush=True)
+            kept.write_bytes(pickle.dumps((number + 1, tables, honesty, unsettled)))
             scores = {str(v): {**table.summary(), "unsettled": unsettled[v]} for v, table in tables.items()}
             yield scores, {str(v): honesty[v].summary() for v in vehicles}
+
+
+def _begun(kept: Path, vehicles: tuple[int, ...]) -> tuple[int, dict[int, Table], dict[int, Honesty], dict[int, int]]:
+    """Return how many runs were done, and what they found."""
+    if not kept.exists():
+        return 0, {v: Table() for v in vehicles}, {v: Honesty() for v in vehicles}, dict.fromkeys(vehicles, 0)
+    state: tuple[int, dict[int, Table], dict[int, Honesty], dict[int, int]]
+    state = pickle.loads(kept.read_bytes())  # noqa: S301 - written by this program
+    return state
 
 
 def priors(fleets: Path, case: Case, n_replicates: int, vehicles: tuple[int, ...]) -> dict[str, Any]:
@@ -141,11 +163,11 @@ def priors(fleets: Path, case: Case, n_replicates: int, vehicles: tuple[int, ...
     for v in vehicles:
         tables = {name: Table() for name in PRIOR_CASES}
         shares: dict[str, list[float]] = {name: [] for name in PRIOR_CASES}
-        for number, whole in enumerate(runs(fleets, case, n_replicates)):
+        for number, whole in runs(fleets, case, n_replicates):
             run = whole.first_vehicles(v)
             alone = joint(run)
             for name, how in PRIOR_CASES.items():
-                prior, judged = stale_prior(run, whole.in_view, how, seed=number)
+                prior, judged = stale_prior(run, whole.in_view, how, seed=case.seed + number)
                 fused = joint(run, prior)
                 tables[name].add("with", score_joint(judged, fused))
                 tables[name].add("without", score_joint(run, alone))
@@ -165,17 +187,17 @@ def robustness(fleets: Path, name: str, n_replicates: int, vehicles: tuple[int, 
     tables = {v: Table() for v in vehicles}
     coverage: dict[int, list[float]] = {v: [] for v in vehicles}
     settled: dict[int, list[bool]] = {v: [] for v in vehicles}
-    for number, whole in enumerate(runs(fleets, case, n_replicates)):
+    for number, whole in runs(fleets, case, n_replicates):
         if number % case.batch == 0:
             at = simulated(fleets, case, number)
-            corrected = bool(case.settings.get("send_information", True))
-            maps = {v: dbscan(at, case, v, corrected=corrected) for v in vehicles}
+            rival = "dbscan corrected" if case.settings.get("send_information", True) else "dbscan by default"
+            maps = {v: dbscan(at, case, v, RIVALS[rival]) for v in vehicles}
         for v in vehicles:
             run = whole.first_vehicles(v)
             fused = joint(run)
             tables[v].add("joint", score_joint(run, fused))
             tables[v].add("known", known(run).score)
-            tables[v].add("dbscan corrected" if corrected else "dbscan", score_dbscan(run, maps[v]))
+            tables[v].add(rival, score_dbscan(run, maps[v]))
             coverage[v].append(covered(run, fused))
             settled[v].append(fused.is_settled)
     found = {
@@ -188,6 +210,20 @@ def robustness(fleets: Path, name: str, n_replicates: int, vehicles: tuple[int, 
     }
     for size, row in found.items():
         print(name, size, _short(row), f"coverage {row['coverage_90']:.2f} settled {row['settled']:.2f}", flush=True)
+    return found
+
+
+def shown(folder: Path) -> dict[str, Any]:
+    """Return the figures of a `study compare`, by scenario, tracker and drive, fleet size and method."""
+    found: dict[str, Any] = {}
+    with (folder / "compare" / "summary.csv").open(encoding="utf-8") as stream:
+        for row in csv.DictReader(stream):
+            if row["score"] in {"f1", "gospa_m"}:
+                drive = next(name for name, file in DRIVE_FILES.items() if file == row["place"])
+                of = found.setdefault(f"{row['scenario']}, {row['tracker']}, {drive}", {})
+                of = of.setdefault(row["n_vehicles"], {}).setdefault(row["method"], {})
+                numbers = {name: float(row[name]) for name in ("mean", "sd", "median", "n", "n_null") if row[name]}
+                of[row["score"]] = numbers
     return found
 
 
@@ -218,7 +254,7 @@ def _rounded(value: Any) -> Any:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("bars", "prior", "robustness", "cost"))
+    parser.add_argument("what", choices=("bars", "table", "prior", "robustness", "cost"))
     parser.add_argument("--fleets", type=Path, default=Path("data/processed/benchmark-fleets"))
     parser.add_argument("--drive", choices=("A", "B"), default="A")
     parser.add_argument("--scenario", default="paper-ideal")
@@ -227,14 +263,23 @@ def main() -> None:
     parser.add_argument("--dbscan-replicates", type=int, default=200)
     parser.add_argument("--vehicles", type=int, nargs="+")
     parser.add_argument("--cases", nargs="*", default=[])
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--largest", type=int, default=50, help="vehicles that are simulated")
+    parser.add_argument("--study", type=Path, default=Path("data/processed/fusion-study"))
     given = parser.parse_args()
-    case = Case(given.scenario, given.drive, {"tracker": given.tracker})
+    case = Case(given.scenario, given.drive, {"tracker": given.tracker}, given.largest, seed=given.seed)
     name = f"{given.scenario}, {given.tracker}, {given.drive}"
     if given.what == "bars":
         sizes = tuple(given.vehicles or VEHICLES)
         for scores, honesty in bars(given.fleets, case, given.replicates, given.dbscan_replicates, sizes):
-            keep("bars", name, scores, is_part=True)
-            keep("honesty", name, honesty, is_part=True)
+            if given.seed == SEED:
+                keep("bars", name, scores, is_part=True)
+                keep("honesty", name, honesty, is_part=True)
+            else:
+                keep("fresh", f"{name}, seed {given.seed}", scores, is_part=True)
+    elif given.what == "table":
+        for world, by_size in shown(given.study).items():
+            keep("table", world, by_size)
     elif given.what == "prior":
         keep("prior", name, priors(given.fleets, case, given.replicates, tuple(given.vehicles or (3, 20, 50))))
     elif given.what == "robustness":

@@ -42,6 +42,9 @@ ROBUSTNESS = {
     "one car in ten with a fault of 10 m, 5°": _case(
         mixed__faulty__share=0.1, mixed__faulty__range_bias_m=10.0, mixed__faulty__bearing_bias_deg=5.0
     ),
+    "one car in ten off by 10 m where 1.3 m are declared": _case(
+        mixed__faulty__share=0.1, mixed__faulty__declares="fleet", mixed__faulty__gnss_sigma_m=10.0
+    ),
     "half of the fleet three times worse than declared": _case(
         mixed__worse__share=0.5,
         mixed__worse__declares="fleet",

@@ -102,7 +102,7 @@ def draw_convergence(fleets: Path, path: Path) -> None:
     with figure_file(path, caption=caption, size=(7.0, 3.8)) as figure:
         axes = figure.subplots()
         for v, colour in ((5, ORANGE), (20, BLUE), (50, GREEN)):
-            for number, whole in enumerate(runs(fleets, DEMO, 8)):
+            for number, whole in runs(fleets, DEMO, 8):
                 run = whole.first_vehicles(v)
                 with patch.object(joint_module, "Search", Recorded):
                     joint(run)
@@ -131,7 +131,7 @@ DENSE_M = 20.0
 
 def draw_map(fleets: Path, path: Path) -> None:
     """Draw the map of five passes and of fifty with 90 % ellipses, beside the true signs."""
-    whole = next(iter(runs(fleets, DEMO, 1)))
+    _, whole = next(iter(runs(fleets, DEMO, 1)))
     caption = f"{SIMULATED}, drive A, first replicate. Ellipses hold 90 %, the offset that all passes share included."
     with figure_file(path, caption=caption, size=(9.5, 4.8)) as figure:
         for axes, v in zip(figure.subplots(1, 2, sharex=True, sharey=True), (5, 50), strict=True):

@@ -59,12 +59,14 @@ class Case:
     signs: str = "real"
     batch: int = 20
     """Replicates that are simulated at once."""
+    seed: int = SEED
 
     @property
     def name(self) -> str:
         """A name for its folder."""
         settings = crc32(repr(sorted(self.settings.items())).encode())
-        return f"{self.scenario}-{self.drive}-{self.signs}-{self.n_vehicles}-{settings:08x}"
+        seed = "" if self.seed == SEED else f"-seed{self.seed}"
+        return f"{self.scenario}-{self.drive}-{self.signs}-{self.n_vehicles}-{settings:08x}{seed}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,10 +183,10 @@ def _regular(signs: pa.Table, drive: pa.Table) -> pa.Table:
     return build_table(SIGNS, columns | made, geometry=frame.to_lonlat(place))
 
 
-def runs(folder: Path, case: Case, n_replicates: int) -> Iterator[Run]:
-    """Yield the replicates of a case, simulated where they are not there yet, some at a time."""
-    for first in range(0, n_replicates, case.batch):
-        yield from islice(_batch(folder, case, first), n_replicates - first)
+def runs(folder: Path, case: Case, n_replicates: int, *, first: int = 0) -> Iterator[tuple[int, Run]]:
+    """Yield the replicates of a case with their numbers, from a batch on, simulated where they are not there yet."""
+    for begin in range(first, n_replicates, case.batch):
+        yield from enumerate(islice(_batch(folder, case, begin), n_replicates - begin), begin)
 
 
 def simulated(folder: Path, case: Case, first: int) -> Path:
@@ -201,7 +203,7 @@ def simulated(folder: Path, case: Case, first: int) -> Path:
             n_vehicles=case.n_vehicles,
             n_replicates=case.batch,
             first_replicate=first,
-            seed=SEED,
+            seed=case.seed,
         )
     return out
 

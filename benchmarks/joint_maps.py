@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from joint_fleets import SEED, Run
 
 from geofleet.algorithms.joint import fuse_joint
 from geofleet.algorithms.joint_search import PriorMap
@@ -19,11 +18,12 @@ from geofleet.config import load_config
 from geofleet.steps.aggregate import aggregate
 from geofleet.tables.schemas import SIGNS
 from geofleet.tables.store import lonlat, read_table
+from geofleet.workflows.study.methods import METHODS, with_settings
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from joint_fleets import Case
+    from joint_fleets import Case, Run
     from numpy.typing import NDArray
 
     from geofleet.algorithms.joint import JointMap
@@ -136,7 +136,7 @@ def stale_prior(run: Run, rows: Ints, how: Staleness = STALE, *, seed: int) -> t
     """
     scene, code = run.reference.take(pa.array(rows)), run.reference_code[rows]
     lon, lat = lonlat(scene)
-    copy = make_stale(sign_keys(scene["sign_id"].to_pylist()), lon, lat, code, how, seed=SEED + seed)
+    copy = make_stale(sign_keys(scene["sign_id"].to_pylist()), lon, lat, code, how, seed=seed)
     n = len(lon)
     there = np.append(copy.fate != REMOVED, np.ones(len(copy.key), bool))
     prior = PriorMap(
@@ -156,17 +156,14 @@ def score_prior(run: Run, prior: PriorMap) -> MapScore:
     return run.score(prior.xy_m, prior.class_code)
 
 
-def dbscan(
-    folder: Path, case: Case, n_vehicles: int, *, corrected: bool
-) -> dict[str, tuple[Floats, Floats, list[str]]]:
-    """Return DBSCAN's maps of a batch of replicates by run: longitude, latitude, class; made once, like the fleets."""
-    out = folder / f"dbscan-{n_vehicles}{'-corrected' if corrected else ''}.parquet"
+def dbscan(folder: Path, case: Case, n_vehicles: int, label: str) -> dict[str, tuple[Floats, Floats, list[str]]]:
+    """Return the maps of a batch of replicates by a method of studies: longitude, latitude, class by run; made once."""
+    out = folder / f"{label}-{n_vehicles}.parquet"
     if not out.exists():
-        config = load_config(case.scenario, {"method": "dbscan", "correct_bias": corrected})
         aggregate(
             folder / "detections",
             out,
-            config=config,
+            config=with_settings(load_config(case.scenario), METHODS[label]),
             n_vehicles=n_vehicles,
             passes=folder / "passes.parquet",
             n_workers=1,

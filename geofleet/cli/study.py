@@ -282,11 +282,11 @@ def _print_fleet_sizes(result: FleetSizeResult) -> None:
 
 def _print_nulls(table: tuple[dict[str, Any], ...]) -> None:
     """Say which means leave fleets out."""
+    varying = [name for name in ("scenario", "place", "setting") if len({row.get(name) for row in table}) > 1]
     for row in table:
         if row["n_null"]:
-            typer.echo(
-                f"{row['method']}, {row['n_vehicles']} vehicles: {row['n_null']} fleets without a match left out"
-            )
+            where = ", ".join([*(row[name] for name in varying), row["method"], f"{row['n_vehicles']} vehicles"])
+            typer.echo(f"{where}: {row['n_null']} fleets without a match left out")
 
 
 @app.command()
