@@ -216,7 +216,10 @@ def _passes_note(contents: Contents) -> str:
     """Say how many passes are not what they declare."""
     passes = [row for row in contents.nuisance if row["n_detections"]]  # the prior map has a row as well
     n, n_suspect = len(passes), sum(row["is_suspect"] for row in passes)
-    text = "What joint fusion found that all detections of a pass have in common, and took out of them. "
+    text = (
+        "What joint fusion found that all detections of a pass have in common, and took out of them. "
+        "Alone: detections of signs that no other pass reports although three or more had them in view. "
+    )
     if not n_suspect:
         return f"{text}All {n} are as they declare."
     return f"{text}{n_suspect} of {n} are far from what they declare (*): have the car looked at."
@@ -225,7 +228,7 @@ def _passes_note(contents: Contents) -> str:
 def _pass(row: Mapping[str, Any]) -> dict[str, Any]:
     numbers = ("offset_e_m", "offset_n_m", "range_bias_m", "bearing_bias_deg", "noise_factor", "jitter_m")
     name = f"{row['pass_id']} *" if row["is_suspect"] else row["pass_id"]
-    return {"name": name, **{k: row[k] for k in ("sensor_kind", "n_detections")}} | {
+    return {"name": name, **{k: row[k] for k in ("sensor_kind", "n_detections", "n_alone")}} | {
         k: _number(row[k], 2) for k in numbers
     }
 
