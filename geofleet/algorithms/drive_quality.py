@@ -157,7 +157,8 @@ def _torn(t_s: Floats, xyz_m: Floats, jump_m: float) -> Flags:
     torn: Flags = np.asarray(np.linalg.norm(step, axis=1) > jump_m + MAX_SPEED_MPS * dt)
     if len(dt) < 2:  # noqa: PLR2004 - one step has no neighbour
         return torn
-    change = np.linalg.norm(np.diff(step / dt[:, None], axis=0), axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # steps of next to no time
+        change = np.linalg.norm(np.diff(step / dt[:, None], axis=0), axis=1)
     both = dt[1:] + dt[:-1]
     fits_before = np.append(False, change * dt[1:] <= _allowed_m(dt[1:], both, jump_m))
     fits_after = np.append(change * dt[:-1] <= _allowed_m(dt[:-1], both, jump_m), False)

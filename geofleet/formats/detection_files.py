@@ -118,6 +118,7 @@ def _parquet_batches(path: Path) -> Iterator[Batch]:
         name, crs, dropped = _geometry_of(file.schema_arrow)
         first = 1
         for block in file.iter_batches(batch_size=BATCH_ROWS, use_threads=False):
+            block.validate(full=True)  # text that is not UTF-8 would be found anywhere later
             table = pa.Table.from_batches([block]).replace_schema_metadata(None)
             geometry = None
             if name:
@@ -149,6 +150,7 @@ def _geometry_of(schema: pa.Schema) -> tuple[str, Any, list[str]]:
 
 def _feature_batches(path: Path) -> Iterator[Batch]:
     features = read_features(path)
+    features.table.validate(full=True)  # as above
     for first in range(0, features.table.num_rows, BATCH_ROWS):
         shapes = None if features.geometry is None else features.geometry[first : first + BATCH_ROWS]
         yield Batch(features.table.slice(first, BATCH_ROWS), shapes, features.crs, first + 1)

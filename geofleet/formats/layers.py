@@ -181,5 +181,5 @@ def _is_own_table(path: Path) -> bool:
     """Tell whether a Parquet file is a table of geofleet; a damaged file is not, and its reader will say so."""
     try:
         return _MARK in (pq.read_metadata(path).metadata or {})
-    except (pa.ArrowInvalid, OSError):
+    except (pa.ArrowException, OSError, ValueError):
         return False

@@ -58,7 +58,8 @@ class _Counts:
         for reason in read.skipped if len(self.samples) < _MAX_SAMPLES else ():
             if reason not in self.samples:
                 first = read.rejected.filter(pc.field("reason") == reason).slice(0, 1).to_pylist()[0]
-                self.samples[reason] = f"{first['source']} row {first['row']}: {first['content'][:120]}"
+                content = " ".join(first["content"][:120].split())
+                self.samples[reason] = f"{first['source']} row {first['row']}: {content}"
 
 
 def ingest_detections(
