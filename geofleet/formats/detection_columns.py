@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 # Thing to the names that people give it, most telling first; compared in lower case, letters and digits only
 NAMES = {
     "sign_class": "signclass",
-    "raw_code": "rawcode code trafficsigncode trafficsign signcode classname label value objectvalue class signtype "
-    "type",
+    "raw_code": "rawcode code trafficsigncode trafficsign signcode mutcdcode mutcd classname label value objectvalue "
+    "class signtype type",
     "country": "country countrycode",
     "x": "lon longitude lng long x easting",
     "y": "lat latitude y northing",

@@ -142,8 +142,12 @@ def _geometry_of(schema: pa.Schema) -> tuple[str, Any, list[str]]:
     crs = about.get("crs", CRS84)  # absent means CRS84, null means unknown
     if isinstance(crs, dict):
         from pyproj import CRS  # noqa: PLC0415  (takes a moment to load)
+        from pyproj.exceptions import CRSError  # noqa: PLC0415
 
-        crs = CRS.from_json_dict(crs).to_wkt()
+        try:
+            crs = CRS.from_json_dict(crs).to_wkt()
+        except CRSError as error:
+            raise ValueError(f"its CRS cannot be read: {str(error)[:100]}") from None
     covering = [side[0] for side in about.get("covering", {}).get("bbox", {}).values()]
     return name, crs, [n for n in dict.fromkeys([*geo["columns"], *covering]) if n in schema.names]
 

@@ -39,6 +39,7 @@ from geofleet.formats.reading import WGS84
 from geofleet.tables.schemas import DETECTIONS
 from geofleet.tables.store import build_table
 from geofleet.taxonomy import load_taxonomy
+from geofleet.taxonomy.reader import RAW_PREFIX
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -234,7 +235,7 @@ def _classes(table: pa.Table, plan: _Plan) -> tuple[pa.Array, pa.Array, pa.Array
     given = text_column(table, chosen.get("sign_class"))
     raw = text_column(table, chosen.get("raw_code"))
     if "sign_class" in chosen and not plan.scheme:
-        return given, raw, country, 0
+        return given, raw, country, _n_unknown(given)
     raw = pc.coalesce(raw, given)
     # each distinct pair of code and country is looked up once
     key = pc.binary_join_element_wise(raw, pc.fill_null(country, ""), "\x1f").dictionary_encode()
@@ -249,6 +250,14 @@ def _classes(table: pa.Table, plan: _Plan) -> tuple[pa.Array, pa.Array, pa.Array
     classes = pa.array(known.sign_class.tolist(), pa.string()).take(key.indices)
     is_known = pa.array(known.known.tolist(), pa.bool_()).take(key.indices)
     return classes, raw, country, int(pc.sum(pc.equal(is_known, False)).as_py() or 0)  # noqa: FBT003  (a value)
+
+
+def _n_unknown(sign_class: pa.Array) -> int:
+    """Return how many classes name no concept of the vocabulary; raw codes are meant to be none."""
+    concepts = load_taxonomy().concepts
+    counted = pc.value_counts(sign_class.drop_null())
+    named = zip(counted.field("values").to_pylist(), counted.field("counts").to_pylist(), strict=True)
+    return sum(n for name, n in named if name.partition(":")[0] not in concepts and not name.startswith(RAW_PREFIX))
 
 
 def _keys(table: pa.Table, plan: _Plan, row: NDArray[np.int64]) -> dict[str, pa.Array]:

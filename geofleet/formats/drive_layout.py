@@ -26,7 +26,8 @@ THINGS = (
 _OPTIONS = ("crs", "origin", "time_format", "day_first", "delimiter", "encoding")
 # Compared in lower case, letters and digits only; most telling first
 _NAMES = {
-    "time": "tutc utc timestamp timestampns unixtime datetime time gpstime timeutc epoch zeit zeitstempel heure t",
+    "time": "tutc utc utime timestamp timestampns unixtime datetime time gpstime timeutc epoch zeit zeitstempel heure "
+    "t",
     "date": "date datum",
     "x": "lon longitude lng long londeg lngdeg longitudedeg längengrad laengengrad länge laenge",
     "y": "lat latitude latdeg latitudedeg breitengrad breite",
@@ -35,8 +36,10 @@ _NAMES = {
     "satellites": "nsatellites numsatellites satellites nsat nsats numsat numsats numsv ns",
     "sigma_e": "sigmaem sigmae sde sdem",
     "sigma_n": "sigmanm sigman sdn sdnm",
-    "drive": "driveid drive tripid trackid",
+    "drive": "driveid drive tripid trip trackid vehicleid vehicle carid deviceid",
 }
+# What a name may have around it: `%time,field.latitude` of rostopic, and units that change nothing
+_AROUND = re.compile(r"^(?:%|field\.)|\s*[(\[](?:s|sec|deg|degrees|°|m)[)\]]$", re.IGNORECASE)
 # Of coordinates that are not degrees, which only a CRS can tell
 _PROJECTED_NAMES = {"x": "x easting xm e rechtswert utmx utmeasting", "y": "y northing ym n hochwert utmy utmnorthing"}
 
@@ -196,7 +199,7 @@ def _profile(line: str, header: list[str]) -> str:
 
 def _guess(header: list[str], given: Mapping[str, str], *, is_projected: bool) -> dict[str, str]:
     """Return a column for each thing that is not given, by its name; a date without a time of day beside it is one."""
-    plain = {re.sub(r"[\W_]+", "", name.lower()): name for name in reversed(header)}
+    plain = {re.sub(r"[\W_]+", "", _AROUND.sub("", name.lower())): name for name in reversed(header)}
     taken = set(given.values())
     guessed = {}
     for thing, names in _NAMES.items():

@@ -72,8 +72,8 @@ class InventoryColumns:
 # What people call these columns, most telling first; compared in lower case, letters and digits only
 _NAMES = {
     "code": "rawcode trafficsigncode trafficsign signcode code osmtrafficsign objectvalue mutcdcode mutcd bordkode "
-    "bordcode rvvcode verkehrszeichen vznummer vznr zeichen codepanneau panneau merkkikoodi signtype signclass "
-    "sign schild zeichennummer stvo value class type",
+    "bordcode rvvcode verkehrszeichen vznummer vznr vz zeichen codepanneau panneau merkkikoodi signtype signclass "
+    "sign signs schild zeichennummer stvo value class type",
     "value": "signvalue textonsign opschrift speedlimit maxspeed extratext",
     "sign_id": "signid id osmid objectid gid fid uuid ogcfid featureid",
     "facing": "facingdeg facing direction azimuth bearing orientation compassangle kijkrichting richtung heading",

@@ -13,7 +13,17 @@ import pyarrow.parquet as pq
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats import osm
 from geofleet.formats.osm_value import is_own_osm
-from geofleet.formats.reading import BZIP2, GZIP, LayerRead, LayerStream, read_head, unpacked_head
+from geofleet.formats.reading import (
+    BZIP2,
+    GZIP,
+    ZIP,
+    LayerRead,
+    LayerStream,
+    is_packed,
+    read_head,
+    unpacked,
+    unpacked_head,
+)
 from geofleet.formats.xml import root_tag
 from geofleet.tables.schemas import DRIVES, LANES, SIGNS, Schema
 from geofleet.tables.store import read_table
@@ -89,18 +99,31 @@ def recognise(path: Path) -> str:
         The file is missing, unreadable or empty.
     """
     head = read_head(path)
+    if head.startswith(ZIP) and is_packed(path):
+        with unpacked(path) as plain:
+            return recognise(plain)
     if head.startswith(b"PAR1"):
         return _OWN if _is_own_table(path) else _INVENTORY
     if root_tag(unpacked_head(path) if head.startswith((GZIP, BZIP2)) else head) == "OpenDRIVE":
         return _OPENDRIVE
+    return _recognise_map(path, head) or (_INVENTORY if _is_inventory(head) else "")
+
+
+def _recognise_map(path: Path, head: bytes) -> str:
+    """Return the format of a map in one of OpenStreetMap's encodings, or of an inventory packed as they are, or ""."""
     encoding = osm.detect(head)
+    if encoding in {"osm.gz", "osm.bz2"} and _is_inventory(unpacked_head(path)):
+        return _INVENTORY
     if encoding == "osm" and is_own_osm(head):
         return _OWN_OSM
     if encoding in {"osm", "osm.gz", "osm.bz2"}:
         return _LANELET2 if import_module("geofleet.formats.lanelet2_map").is_lanelet2(path) else osm.FORMAT
-    if encoding:
-        return osm.FORMAT
-    return _INVENTORY if import_module("geofleet.formats.inventory").detect(head) else ""
+    return osm.FORMAT if encoding else ""
+
+
+def _is_inventory(head: bytes) -> bool:
+    """Tell whether a file's first bytes are an inventory's, packed with nothing."""
+    return not osm.detect(head) and bool(import_module("geofleet.formats.inventory").detect(head))
 
 
 def unknown(path: Path) -> str:
@@ -160,7 +183,11 @@ def read_layer(
             where=str(path),
             todo=f"It takes {', '.join(f'--{name}'.replace('_', '-') for name in sorted(takes)) or 'no option'}.",
         )
-    return layer.reader(schema)(path, **{name: value for name, value in given.items() if name in takes})
+    read, taken = layer.reader(schema), {name: value for name, value in given.items() if name in takes}
+    if is_packed(path) and (found == _INVENTORY or read_head(path).startswith(ZIP)):
+        with unpacked(path) as plain:
+            return read(plain, **taken)
+    return read(path, **taken)
 
 
 def read_drives(path: Path) -> LayerRead:

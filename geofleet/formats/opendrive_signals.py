@@ -41,6 +41,7 @@ ON_BOARDS = "signs on boards"
 
 _NONE = frozenset({"", "-1", "none", "null"})
 _YES = frozenset({"yes", "true", "1"})
+_OWN_CATALOGUE = "DE"  # what RoadRunner and CARLA call the country OpenDRIVE has the numbers of the StVO
 _STVO_PLATE = re.compile(r"10\d\d")
 _DEPENDENCIES = ("dependency", "signalDependency")
 _OF_BOARDS = ("orientation", "hOffset", "country", "countryRevision")  # and of the signs on them, unless they say so
@@ -147,7 +148,8 @@ class SignalReader:
         code, value, unit = self._code(element)
         named = element.get("country", "").strip()
         country = country_code(named) or (None if named else self.country)
-        meaning, raw_code = _understood(code, value, unit, country)
+        catalogue = _OWN_CATALOGUE if named.lower() == "opendrive" else country
+        meaning, raw_code = _understood(code, value, unit, catalogue)
         if not code:
             raw_code = element.get("name", "").strip() or "untyped"
             meaning = load_taxonomy().meaning(raw_code, scheme="opendrive")

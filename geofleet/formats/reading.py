@@ -165,6 +165,12 @@ def unpacked(path: Path) -> Iterator[Path]:
             raise InputError(error.what, where=error.where.replace(str(copy), str(path)), todo=error.todo) from None
 
 
+def is_packed(path: Path) -> bool:
+    """Tell whether a file is packed with gzip or bzip2, or is a zip of one file; errors as `read_head`."""
+    head = read_head(path)
+    return head.startswith((GZIP, BZIP2)) or (head.startswith(ZIP) and bool(_only_member(path)))
+
+
 def _only_member(path: Path) -> str:
     """Return the name of the one file in a zip, "" when it holds others or is damaged."""
     try:

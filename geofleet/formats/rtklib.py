@@ -41,7 +41,7 @@ _ESCAPE_MPS = 11_200.0  # what moves faster leaves the Earth
 
 _DATED = re.compile(rb"\s*\d{4}/\d{1,2}/\d{1,2}[\s,;]+\d{1,2}:\d{2}:\d")
 _WEEKLY = re.compile(rb"\s*\d{1,4}[\s,;]+\d{1,6}\.\d+[\s,;]+-?\d{1,3}\.\d+[\s,;]+-?\d{1,3}\.\d+[\s,;]")
-_HEADER_MARKS = (b"RTKLIB", b"RTKPOST", b"% program", b"Q=1:fix", b"latitude", b"-ecef(m)", b"-baseline(m)")
+_HEADER_MARKS = (b"RTKLIB", b"RTKPOST", b"% program", b"Q=1:fix", b"latitude(", b"-ecef(m)", b"-baseline(m)")
 _HEADER_DATE = re.compile(r"(?:obs|sol) start\s*:\s*(\d{4}/\d{2}/\d{2})")
 
 
@@ -55,6 +55,7 @@ class _Header:
     is_sexagesimal: bool
     is_derived: bool
     is_above_sea: bool
+    is_tokyo: bool
     start: np.datetime64 | None
 
 
@@ -97,6 +98,10 @@ def read_epochs(path: Path) -> tuple[Epochs, dict[str, int], dict[str, int]]:
     header = _header([line for line in text.splitlines() if line.startswith("%")])
     if header.is_baseline:
         raise _baseline("a baseline solution (e/n/u metres from a base station)", path)
+    if header.is_tokyo:
+        raise InputError(
+            "positions are in the Tokyo datum, some 400 m from WGS 84.", where=str(path), todo="Solve again in WGS84."
+        )
     frame, n_lines = _columns(text)
     t_utc = _times(frame, header)
     place, readable = _places(frame, header)
@@ -141,6 +146,7 @@ def _header(lines: list[str]) -> _Header:
         is_ecef="x-ecef" in text or "x/y/z-ecef" in text,
         is_sexagesimal="latitude(d'" in titles,
         is_above_sea="=WGS84/geodetic" in text,
+        is_tokyo="lat/lon/height=Tokyo" in text,
         is_derived=any("program" in line and DERIVED in line for line in lines),
         start=None if start is pd.NaT else start.to_datetime64(),
     )

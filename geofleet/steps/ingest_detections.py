@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 
 from geofleet.errors import InputError
 from geofleet.formats import detections
+from geofleet.formats.reading import unpacked
 from geofleet.tables.hive import HiveWriter, TooManyFoldersError
 from geofleet.tables.manifest import write_manifest
 from geofleet.tables.schemas import DETECTIONS
@@ -123,10 +124,11 @@ def _stream(
             for done, path in enumerate(paths):
                 if progress:
                     progress(done, len(paths))
-                for read in detections.read_detections(path, rows_before=counts.n_before, **options):
-                    writer.write(read.table)
-                    rejects.write_table(read.rejected)
-                    counts.add(read)
+                with unpacked(path) as plain:
+                    for read in detections.read_detections(plain, rows_before=counts.n_before, **options):
+                        writer.write(read.table)
+                        rejects.write_table(read.rejected)
+                        counts.add(read)
                 counts.n_before = counts.n_rows + counts.n_rejected
         writer.close()
         if not counts.n_rows:

@@ -215,3 +215,18 @@ def test_swapped_axes_are_refused_where_the_rows_name_their_country(tmp_path):
 def test_a_folder_is_no_file(tmp_path):
     with pytest.raises(InputError, match=r"a folder, not a file.*/\*"):
         one(tmp_path)
+
+
+def test_classes_that_name_no_concept_are_told(tmp_path):
+    read = one(
+        csv_file(tmp_path, "lon,lat,sign_class\n13,52,stop\n13,52,Stop Sign\n13,52,raw:x\n13,52,speed_limit:30\n")
+    )
+    assert read.table["sign_class"].to_pylist() == ["stop", "Stop Sign", "raw:x", "speed_limit:30"]
+    assert read.found["codes that the vocabulary does not know"] == 1
+
+
+def test_text_of_parquet_that_is_not_utf_8_is_refused(tmp_path):
+    text = pa.array([b"stop", b"\xff\xfe"]).view(pa.string())
+    pq.write_table(pa.table({"lon": [13.0, 13.1], "lat": [52.0, 52.1], "sign_class": text}), tmp_path / "fleet.parquet")
+    with pytest.raises(InputError, match=r"damaged or not parquet.*UTF8"):
+        list(read_detections(tmp_path / "fleet.parquet"))

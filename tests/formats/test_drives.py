@@ -130,6 +130,12 @@ def test_a_baseline_without_a_header_is_refused_by_its_speed(tmp_path):
         read_drive(pos(tmp_path, "".join(lines)))
 
 
+def test_positions_in_the_tokyo_datum_are_refused(tmp_path):
+    head = "% program : RTKLIB\n% (lat/lon/height=Tokyo/ellipsoidal,Q=1:fix)\n"
+    with pytest.raises(InputError, match=r"Tokyo datum.*Solve again in WGS84"):
+        read_drive(pos(tmp_path, head + TITLE.format("GPST") + rows(["2023/07/11 06:04:30.000"])))
+
+
 def test_heights_above_sea_level_are_told_and_not_taken(tmp_path):
     head = "% program : RTKLIB\n% (lat/lon/height=WGS84/geodetic,Q=1:fix)\n"
     layer = read_drive(pos(tmp_path, head + TITLE.format("GPST") + rows(["2023/07/11 06:04:30.000"])))

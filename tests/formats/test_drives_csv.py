@@ -203,3 +203,21 @@ def test_metres_called_x_and_y_are_a_position_once_a_crs_is_known(tmp_path):
 def test_a_drive_in_the_middle_of_the_sea_is_told(tmp_path):
     layer = read_drive(csv_file(tmp_path, "time,lat,lon\n2024-05-01T12:00:00Z,-40,-120\n"))
     assert any("from any land" in told for told in layer.found)
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["%time,field.header.seq,field.latitude,field.longitude", "utime,seq,Latitude (deg),Longitude [deg]"],
+)
+def test_names_as_robots_write_them(tmp_path, header):
+    lines = "".join(f"{1714564800_000000000 + s * 10**9},{s},{48 + s * 1e-4},11\n" for s in range(5))
+    layer = read_drive(csv_file(tmp_path, f"{header}\n{lines}"))
+    assert layer.file_format == "csv"
+    assert layer.table["t_utc"][0].as_py() == datetime(2024, 5, 1, 12, tzinfo=UTC)
+    np.testing.assert_allclose(lonlat(layer.table)[1], 48 + np.arange(5) * 1e-4)
+
+
+def test_cars_of_one_file_are_drives_of_their_own(tmp_path):
+    lines = "".join(f"v{s % 2},2024-05-01T12:00:{s:02d}Z,{48 + s % 2 + s * 1e-4},11\n" for s in range(10))
+    table = read_drive(csv_file(tmp_path, f"vehicle_id,time,lat,lon\n{lines}")).table
+    assert table["drive_id"].to_pylist() == ["drive-v0"] * 5 + ["drive-v1"] * 5

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import json
+import zipfile
 
 import geopandas
 import numpy as np
@@ -13,6 +16,7 @@ import pytest
 import shapely
 
 from geofleet.errors import ConfigError, InputError
+from geofleet.formats import layers
 from geofleet.formats.inventory import read_signs
 from geofleet.formats.inventory_columns import coordinates, texts
 from geofleet.tables.store import lonlat
@@ -157,3 +161,35 @@ def test_codes_that_are_numbers_stay_as_written():
 def test_json_that_is_no_layer_says_why(write, text, encoding, message):
     with pytest.raises(InputError, match=message):
         read_signs(write(text, "signs.geojson", encoding))
+
+
+FEATURE = {"type": "Feature", "properties": {"code": "206"}, "geometry": {"type": "Point", "coordinates": [11.5, 48.1]}}
+PACKED = {"type": "FeatureCollection", "features": [FEATURE]}
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("signs.csv", "Nr;Breite;Länge;VZ\n1;48,1;11,5;206\n"),
+        ("signs.geojson", json.dumps(PACKED)),
+    ],
+)
+def test_packed_files_are_read_as_what_is_in_them(tmp_path, name, text):
+    gz, bz, archive = (tmp_path / f"{name}.{suffix}" for suffix in ("gz", "bz2", "zip"))
+    gz.write_bytes(gzip.compress(text.encode()))
+    bz.write_bytes(bz2.compress(text.encode()))
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(name, text)
+    for path in (gz, bz, archive):
+        assert layers.recognise(path) == "inventory"
+        table = layers.read_layer(path).table
+        assert table["sign_class"].to_pylist() == ["stop"]
+        assert lonlat(table)[0] == [11.5]
+
+
+def test_a_map_in_a_zip_is_read(tmp_path):
+    text = "<osm version='0.6'><node id='1' lat='52.5' lon='13.4'><tag k='traffic_sign' v='DE:206'/></node></osm>"
+    with zipfile.ZipFile(tmp_path / "map.zip", "w") as file:
+        file.writestr("map.osm", text)
+    assert layers.recognise(tmp_path / "map.zip") == "osm"
+    assert layers.read_layer(tmp_path / "map.zip").table["sign_class"].to_pylist() == ["stop"]

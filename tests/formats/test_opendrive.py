@@ -170,6 +170,14 @@ def test_signals_without_a_country_can_be_given_one(signs):
     assert (row["sign_class"], row["country"]) == ("yield", "DE")
 
 
+@pytest.mark.parametrize(("code", "found"), [("206", "stop"), ("274", "speed_limit:30"), ("1000001", "traffic_light")])
+def test_signals_of_the_country_opendrive_have_the_numbers_of_the_stvo(signs, code, found):
+    value = "30" if code == "274" else "-1"
+    row = signs(road(signals=signal(country="OpenDRIVE", type=code, value=value)))["1"]
+    assert (row["sign_class"], row["country"]) == (found, None)
+    assert signs(road(signals=signal(country="", type="206")))["1"]["sign_class"] == "raw:206"
+
+
 def test_the_revision_of_the_catalogue_is_kept(signs):
     assert signs(road(signals=signal(countryRevision="2017")))["1"]["country_revision"] == "2017"
     assert signs(road(signals=signal()))["1"]["country_revision"] is None

@@ -205,3 +205,22 @@ def test_looking_plain_codes_up_finds_what_trying_every_rule_finds(country):
         every = (rule for rule in rules.rules if any(rule.pattern.fullmatch(one) for one in candidates))
         chosen = (r for r in rules.that_may_match(candidates) if any(r.pattern.fullmatch(one) for one in candidates))
         assert next(chosen, None) is next(every, None), code
+
+
+@pytest.mark.parametrize(
+    ("country", "code", "found"),
+    [
+        ("FR", "B6b1", "no_parking_zone"), ("FR", "B6b2", "alternate_parking"), ("FR", "B6b4", "parking_zone"),
+        ("FR", "B50a", "end_no_parking_zone"), ("FR", "B50d", "end_parking_zone"),
+        ("FR", "B12a[10]", "axle_load_limit:10"),
+        ("FR", "AK1b", "curve_left"), ("FR", "AK3a", "road_narrows_right"), ("FR", "A21b", "warn_cyclists"),
+        ("FR", "C24b", "lane_arrangement"), ("FR", "B27b", "trams_only"), ("FR", "C25a", "speed_overview"),
+        ("FR", "C109", "pedestrian_zone"), ("FR", "C62", "toll"), ("FR", "KD4", "direction_sign"),
+        ("FR", "M9v", "plate_except"), ("FR", "M10b", "plate_text"), ("FR", "M5[150 m]", "plate_distance:150"),
+        ("US", "W1-15L", "curve_left"), ("US", "W7-6", "crest"), ("US", "W11-21", "wild_animals"),
+        ("US", "W9-1R", "lanes_merge"), ("US", "R2-4[45]", "minimum_speed:45mph"), ("US", "S5-2", "end_speed_zone"),
+        ("BE", "A7b", "road_narrows_left"), ("BE", "F79", "lanes_merge"), ("BE", "E11", "alternate_parking"),
+    ],
+)  # fmt: skip
+def test_codes_that_were_held_against_the_acts(country, code, found):
+    assert TAXONOMY.meaning(code, country=country).sign_class == found
