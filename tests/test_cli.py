@@ -220,12 +220,12 @@ def test_progress_tells_the_time_left_but_not_at_the_end(monkeypatch, capsys):
     monkeypatch.setattr(output, "_SECONDS_A_LINE", -1)
     with output.progress_bar("planning") as tell:
         assert not capsys.readouterr().err
-        for done in (0, 1, 4):
-            tell(done, 4)
+        for done in (2, 3, 4, 6):
+            tell(done, 6)
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "planning ..."
-    assert [line.partition(" after")[0] for line in lines[1:]] == [f"planning: {done} of 4" for done in (0, 1, 4)]
-    assert ["left" in line for line in lines[1:]] == [False, True, False]
+    assert [line.partition(" after")[0] for line in lines[1:]] == [f"planning: {done} of 6" for done in (2, 3, 4, 6)]
+    assert ["left" in line for line in lines[1:]] == [False, False, True, False]
 
 
 def test_an_outdated_copy_from_the_command_line(tables, tmp_path):

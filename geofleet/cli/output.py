@@ -47,17 +47,24 @@ class _Lines:
         self._label, self._begin = label, time.monotonic()
         self._last = self._begin
         self._first: int | None = None
+        self._fresh: tuple[float, int] | None = None  # when something was done first, and how much there was then
 
     def tell(self, done: int, total: int) -> None:
-        """Say how much is done; what was there before does not say how fast the rest goes."""
+        """Say how much is done, and how long the rest will take at the pace since the first of it was done.
+
+        What was there before tells no pace, nor does the first: loops are compiled on the way to it.
+        """
         now = time.monotonic()
         if self._first is None:
             self._first = done
             sys.stderr.write(f"{self._label} ...\n")
+        if self._fresh is None and done > self._first:
+            self._fresh = now, done
         if now - self._last >= _SECONDS_A_LINE:
-            self._last, fresh = now, done - self._first
-            is_known = fresh and done < total  # what follows the last one, drawing and writing, is short
-            left = f", about {(now - self._begin) / fresh * (total - done):.0f} s left" if is_known else ""
+            self._last, left = now, ""
+            if self._fresh and self._fresh[1] < done < total:
+                since, before = self._fresh
+                left = f", about {(now - since) / (done - before) * (total - done):.0f} s left"
             sys.stderr.write(f"{self._label}: {done} of {total} after {now - self._begin:.0f} s{left}\n")
 
 

@@ -97,6 +97,7 @@ class _Run:
     n_vehicles: int
     folder: Path
     billboards: Billboards | None
+    n_buckets: int | None  # None: a folder a vehicle
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +131,7 @@ def simulate(
     n_replicates: int = 1,
     first_replicate: int = 0,
     seed: int = 0,
+    n_buckets: int | None = None,
     n_workers: int = 2,
     progress: Progress | None = None,
 ) -> SimulateResult:
@@ -150,6 +152,8 @@ def simulate(
         Passes a run, number of runs, and the seed of all of them.
     first_replicate
         Number of the first run: runs may be simulated apart, and are the same.
+    n_buckets
+        Hashed buckets that the detections of a run lie in; by default a folder a vehicle, `N_BUCKETS` for large fleets.
     n_workers
         Threads.
     progress
@@ -169,11 +173,13 @@ def simulate(
     digest = _digest(config, signs, drive)
     replicates = range(first_replicate, first_replicate + n_replicates)
     run_ids = tuple(_run_id(config.scenario, seed, replicate, digest) for replicate in replicates)
+    if n_buckets is None and n_vehicles > FOLDER_A_VEHICLE:
+        n_buckets = N_BUCKETS
     tally = _Tally(fleet, progress or _silent, n_vehicles * n_replicates)
     with atomic_path(out) as draft, ThreadPoolExecutor(n_workers) as pool:
         draft.mkdir()
         runs = [
-            _Run(run_id, seed, replicate, n_vehicles, draft, fleet.billboards(seed, replicate))
+            _Run(run_id, seed, replicate, n_vehicles, draft, fleet.billboards(seed, replicate), n_buckets)
             for run_id, replicate in sorted(zip(run_ids, replicates, strict=True))  # by key
         ]
         outputs = _in_order(pool, partial(_simulate_batch, fleet), _batches(runs), ahead=2 * n_workers)
@@ -276,7 +282,7 @@ def _simulate_batch(fleet: Fleet, batch: _Batch) -> _BatchOutput:
         n_frame_detections += len(sensed.detections.frame)
         passes.append(driven)
     table = detections_table(passes, fleet.scene.classes, fleet.frame)
-    has_folders = batch.run.n_vehicles <= FOLDER_A_VEHICLE
+    has_folders = batch.run.n_buckets is None
     if has_folders:
         _write_folders(table, batch.run, passes)
     return _BatchOutput(
@@ -331,7 +337,7 @@ def _write_folders(detections: pa.Table, run: _Run, passes: list[SimulatedPasses
 def _write_buckets(detections: pa.Table, run: _Run, part: int) -> None:
     """Write the detections of many vehicles into the buckets that their ids hash to."""
     vehicles = detections["vehicle_id"].combine_chunks().dictionary_encode()
-    bucket_of = np.array([crc32(name.encode()) % N_BUCKETS for name in vehicles.dictionary.to_pylist()])
+    bucket_of = np.array([crc32(name.encode()) % (run.n_buckets or 1) for name in vehicles.dictionary.to_pylist()])
     bucket = bucket_of[vehicles.indices.to_numpy()]
     plain = detections.drop_columns(["run_id"])
     for number in np.unique(bucket).tolist():

@@ -249,6 +249,7 @@ def simulate_fleets(batch: Batch, folder: Path) -> Fleets:
         n_replicates=len(numbers),
         first_replicate=numbers.start,
         seed=batch.seed,
+        n_buckets=1,  # every map reads them, and to open a file a vehicle would take longest
         n_workers=1,
     )
     run_ids = dict(zip(numbers, result.run_ids, strict=True))
@@ -264,7 +265,7 @@ def simulate_fleets(batch: Batch, folder: Path) -> Fleets:
 
 
 def _gather(run: Path, out: Path) -> None:
-    """Put the detections of a run into one file: every map reads them, and opening a file a vehicle takes longest."""
+    """Put the detections of a run into one file, with its name in a column."""
     alone = out.with_suffix("")
     alone.mkdir(parents=True)
     write_table(DETECTIONS, read_table(DETECTIONS, run.rename(alone / run.name).parent), out)
