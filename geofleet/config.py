@@ -24,7 +24,7 @@ from pydantic_core import PydanticCustomError
 from geofleet.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Collection, Iterable, Mapping
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -249,6 +249,7 @@ def load_config(scenario: str | Path = ROOT_SCENARIO, overrides: Mapping[str, An
         *place, name = _locate(key, where="--set")
         _reach(tree, place)[name] = value
         given.add((*place, name))
+    _fix_core(tree, {name for *section, name in given if section == ["aggregate"]})
     mixed = {
         name: {"share": keys.pop("share", None), "sensor": {**tree["sensor"], "sensor_kind": name, **keys}}
         for name, keys in tree.pop(MIXED, {}).items()
@@ -297,7 +298,14 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, dict[str, Any]]:
         for key, value in keys.items():
             _locate(f"{section}.{key}", where=str(path))
             tree[section][key] = value
+    _fix_core(tree, own.get("aggregate", {}))
     return tree
+
+
+def _fix_core(tree: dict[str, dict[str, Any]], given: Collection[str]) -> None:
+    """Take a core rule that is given as it is: who asks for a number of samples means DBSCAN's, whatever the fleet."""
+    if "min_samples" in given and "min_samples_share" not in given:
+        tree["aggregate"]["min_samples_share"] = 0.0
 
 
 def _kinds(kinds: Any, path: Path) -> dict[str, dict[str, Any]]:

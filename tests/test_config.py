@@ -41,6 +41,19 @@ def test_a_file_starts_from_paper(tmp_path):
     assert config.tracking == load_config("paper").tracking
 
 
+def test_a_number_given_for_a_core_is_the_rule_everywhere(tmp_path):
+    """Whoever asks for DBSCAN at 3 means scikit-learn's; the default follows the place."""
+    assert load_config().aggregate.min_samples_share > 0
+    assert load_config("paper", ["min_samples=3"]).aggregate.min_samples_share == 0
+    assert load_config("paper", {"aggregate.min_samples": 5}).aggregate.min_samples_share == 0
+    assert load_config("paper", ["min_samples=3", "min_samples_share=0.7"]).aggregate.min_samples_share == 0.7
+    path = tmp_path / "mine.toml"
+    path.write_text("[aggregate]\nmin_samples = 4\n")
+    assert (load_config(path).aggregate.min_samples, load_config(path).aggregate.min_samples_share) == (4, 0.0)
+    path.write_text("[aggregate]\nmin_samples = 4\nmin_samples_share = 0.6\n")
+    assert load_config(path).aggregate.min_samples_share == 0.6
+
+
 def test_digest_changes_with_what_it_covers_only():
     paper, wide = load_config(), load_config("paper", ["eps_m=5.0"])
     assert paper.digest("sensor") == wide.digest("sensor")

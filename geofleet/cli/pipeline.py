@@ -77,7 +77,10 @@ def aggregate(
     method: Annotated[str | None, typer.Option(help="dbscan, hdbscan, kmeans, kmedoids or joint.")] = None,
     semantic: Annotated[str | None, typer.Option(help="first or after.")] = None,
     eps_m: Annotated[float | None, typer.Option(help="Radius of a neighbourhood, metres: dbscan.")] = None,
-    min_samples: Annotated[int | None, typer.Option(help="Detections that make a core: dbscan.")] = None,
+    min_samples: Annotated[
+        int | None,
+        typer.Option(help="Detections that make a core everywhere: dbscan. Left out, dense places ask for more."),
+    ] = None,
     min_cluster_size: Annotated[int | None, typer.Option(help="Detections that make a cluster: hdbscan.")] = None,
     k: Annotated[int | None, typer.Option("--k", help="Signs of a run: kmeans, kmedoids; 0 = chosen.")] = None,
     k_from: Annotated[Path | None, typer.Option(help="Reference that tells K (an oracle): kmeans, kmedoids.")] = None,

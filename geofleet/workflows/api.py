@@ -65,7 +65,6 @@ def read_drive(path: str | Path) -> GeoDataFrame:
 def simulate(
     signs: GeoDataFrame,
     drive: GeoDataFrame,
-    *,
     scenario: str = "paper",
     n_vehicles: int = 50,
     seed: int = 0,
@@ -99,18 +98,19 @@ def simulate(
 
 def aggregate(
     detections: GeoDataFrame,
-    *,
     method: str = "dbscan",
     semantic: str = "first",
     prior: GeoDataFrame | None = None,
     passes: GeoDataFrame | None = None,
+    *,
     n_vehicles: int | None = None,
     **overrides: Any,
 ) -> GeoDataFrame:
     """Cluster detections and fuse them into a sign map; any key of a scenario may be overridden, e.g. `eps_m=3`.
 
     With `passes`, support is relative to the passes that had a place in view; with `correct_bias=True`, the bias of
-    each pass is taken out first. `method="joint"` takes `passes` as evidence of what was not seen, and a `prior` map.
+    each pass is taken out first; with `min_samples=3`, clusters are scikit-learn's. `method="joint"` takes `passes` as
+    evidence of what was not seen, and a `prior` map.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def aggregate(
         return _read(SIGNS, out)
 
 
-def score_map(map_: GeoDataFrame, reference: GeoDataFrame, *, gate_m: float = 2.0, match_on: str = "class") -> MapScore:
+def score_map(map_: GeoDataFrame, reference: GeoDataFrame, gate_m: float = 2.0, match_on: str = "class") -> MapScore:
     """Score the main signs of a map against a reference (paper, eq. GOSPA_M; DOI 10.23919/ICIF.2017.8009645).
 
     Parameters

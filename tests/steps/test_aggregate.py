@@ -44,11 +44,11 @@ def make_detections(xy, *, frame=HELSINKI, run_id="run-a", **columns):
     return build_table(DETECTIONS, given | columns, geometry=frame.to_lonlat(np.asarray(xy, float).reshape(-1, 2)))
 
 
-def scene(seed=0, n_signs=60, frame=HELSINKI, run_id="run-a"):
+def scene(seed=0, n_signs=60, frame=HELSINKI, run_id="run-a", n_seen=10):
     rng = np.random.default_rng(seed)
     places = rng.uniform(-200, 200, (n_signs, 2))
-    xy = np.repeat(places, 10, axis=0) + rng.normal(0, 1.2, (10 * n_signs, 2))
-    classes = np.repeat(np.array(CLASSES)[rng.integers(0, 3, n_signs)], 10)
+    xy = np.repeat(places, n_seen, axis=0) + rng.normal(0, 1.2, (n_seen * n_signs, 2))
+    classes = np.repeat(np.array(CLASSES)[rng.integers(0, 3, n_signs)], n_seen)
     flips = rng.random(len(xy)) < 0.1
     classes[flips] = np.array(CLASSES)[rng.integers(0, 3, flips.sum())]
     return make_detections(xy, frame=frame, run_id=run_id, sign_class=classes, n_frames=rng.integers(1, 40, len(xy)))
@@ -85,9 +85,10 @@ def test_tiles_workers_batches_and_row_order_do_not_show(tmp_path, monkeypatch, 
     assert result.n_tiles > 60
 
 
-def test_signs_are_the_clusters_of_scikit_learn(tmp_path):
-    table = scene(seed=8)
-    result = run_on(tmp_path, table, min_support=1, min_support_share=0.0)
+@pytest.mark.parametrize("n_seen", [10, 80])
+def test_signs_are_the_clusters_of_scikit_learn(tmp_path, n_seen):
+    table = scene(seed=8, n_seen=n_seen)
+    result = run_on(tmp_path, table, min_samples=3, min_support=1, min_support_share=0.0)
     xy, classes = HELSINKI.to_enu(*lonlat(table)), np.array(table["sign_class"].to_pylist())
     expected = []
     for name in CLASSES:
