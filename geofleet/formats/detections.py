@@ -34,6 +34,7 @@ from geofleet.formats.detection_columns import (
 )
 from geofleet.formats.detection_files import read_batches
 from geofleet.formats.inventory_codes import OSM, guess_country, scheme_of
+from geofleet.formats.inventory_places import geometry_reader
 from geofleet.formats.positions import country_at, doubts, reject_null_island, to_lonlat
 from geofleet.formats.reading import WGS84
 from geofleet.tables.schemas import DETECTIONS
@@ -214,8 +215,10 @@ def _coordinates(batch: Batch, plan: _Plan) -> tuple[Floats, Floats]:
     if "x" in chosen and "y" in chosen:
         return number_column(batch.table, chosen["x"]), number_column(batch.table, chosen["y"])
     if shapes is None:
-        text = text_column(batch.table, chosen.get("geometry")).to_numpy(zero_copy_only=False)
-        shapes = np.asarray(shapely.from_wkt(text, on_invalid="ignore"), object)
+        column = text_column(batch.table, chosen.get("geometry"))
+        first = next(iter(column.drop_null().slice(0, 1).to_pylist()), "")
+        text = column.to_numpy(zero_copy_only=False)
+        shapes = np.asarray(geometry_reader(first)(text, on_invalid="ignore"), object)
     point = shapely.get_type_id(shapes) == _POINT
     return np.where(point, shapely.get_x(shapes), np.nan), np.where(point, shapely.get_y(shapes), np.nan)
 

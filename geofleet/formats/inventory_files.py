@@ -18,6 +18,7 @@ import pyarrow as pa
 import shapely
 
 from geofleet.errors import ConfigError, InputError
+from geofleet.formats import json_records
 from geofleet.formats.osm_tags import is_sign_key
 from geofleet.formats.reading import read_head
 from geofleet.formats.text_tables import ANSI, NOT_UTF8, encoding_of, read_header, text_of_head
@@ -85,6 +86,8 @@ def detect(head: bytes) -> str:
     text = (text_of_head(head).encode() if is_utf16 else head.removeprefix(codecs.BOM_UTF8)).lstrip()
     if _SEQUENCE.match(text):
         return "geojsonseq"
+    if json_records.detect(text):
+        return "json"
     if text.startswith((b"{", b"[")):
         return "esrijson" if _ESRI.search(text) else "geojson"
     if text.startswith(b"<") or (b"\0" in head and not is_utf16):
@@ -101,7 +104,7 @@ def read_features(
     ----------
     path
         GeoJSON, GeoJSON text sequence, Esri JSON, GeoPackage, Shapefile or a zip of one, FlatGeobuf, (Geo)Parquet,
-        CSV.
+        CSV, or rows as JSON.
     layer
         Layer of a GeoPackage or zip; by default the only one with geometry.
     encoding, delimiter
@@ -118,6 +121,8 @@ def read_features(
             return _read_csv(path, encoding, delimiter)
         if found == "parquet":
             return _read_parquet(path)
+        if found == "json":
+            return Features(json_records.read_records(path), None, None, found)
         if found:
             return _read_gdal(path, found, layer)
     except (

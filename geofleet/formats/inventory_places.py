@@ -16,6 +16,7 @@ from geofleet.formats.inventory_files import CRS84
 from geofleet.formats.positions import reject_null_island, to_lonlat
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -127,13 +128,17 @@ def _written(features: Features, chosen: InventoryColumns, skipped: Counter[str]
     return shapes
 
 
+def geometry_reader(text: str) -> Callable[..., Any]:
+    """Return shapely's function for a text that is GeoJSON, well-known bytes in hexadecimal digits, or text."""
+    return shapely.from_geojson if text.startswith("{") else shapely.from_wkb if _HEX.match(text) else shapely.from_wkt
+
+
 def _shape(text: str) -> Any:
     """Return the geometry that a text says, None when it says none."""
     stated = _SRID.match(text)
     body = text[stated.end() :] if stated else text
-    read = shapely.from_geojson if body.startswith("{") else shapely.from_wkb if _HEX.match(body) else shapely.from_wkt
     try:
-        shape = read(body)
+        shape = geometry_reader(body)(body)
     except (shapely.GEOSException, ValueError):
         return None
     return shapely.set_srid(shape, int(stated[1])) if stated and shape is not None else shape

@@ -6,6 +6,7 @@ import bz2
 import gzip
 import json
 import zipfile
+from datetime import UTC, datetime
 
 import geopandas
 import numpy as np
@@ -17,6 +18,7 @@ import shapely
 
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats import layers
+from geofleet.formats.detections import read_detections
 from geofleet.formats.inventory import read_signs
 from geofleet.formats.inventory_columns import coordinates, texts
 from geofleet.tables.store import lonlat
@@ -151,7 +153,7 @@ def test_codes_that_are_numbers_stay_as_written():
 @pytest.mark.parametrize(
     ("text", "encoding", "message"),
     [
-        ('[{"code": "206", "lat": 52.5, "lon": 13.4}]', "utf-8", "JSON, but no GeoJSON"),
+        ('{"code": "206", "lat": 52.5, "lon": 13.4}', "utf-8", "JSON, but no GeoJSON"),
         (collection({"code": "206"}), "utf-16", "in UTF-16"),
         (collection({}), "utf-8", "geometries without any attribute"),
         (json.dumps({"type": "Point", "coordinates": [LON, LAT]}), "utf-8", "geometries without any attribute"),
@@ -193,3 +195,55 @@ def test_a_map_in_a_zip_is_read(tmp_path):
         file.writestr("map.osm", text)
     assert layers.recognise(tmp_path / "map.zip") == "osm"
     assert layers.read_layer(tmp_path / "map.zip").table["sign_class"].to_pylist() == ["stop"]
+
+
+ANSWER = [
+    {
+        "id": "498763468214164",
+        "geometry": {"type": "Point", "coordinates": [LON, LAT]},
+        "object_value": "regulatory--yield--g1",
+        "first_seen_at": "2014-05-13T11:28:10+0000",
+    },
+    {"id": 2, "geometry": {"type": "Point", "coordinates": [LON + 0.01, LAT]}, "object_value": None},
+]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        json.dumps({"data": ANSWER, "paging": {}}),
+        json.dumps(ANSWER, indent=2),
+        "\n".join(json.dumps(row) for row in ANSWER),
+    ],
+)
+def test_rows_as_json(write, text):
+    path = write(text, "signs.json")
+    assert layers.recognise(path) == "inventory"
+    layer = read_signs(path)
+    assert dict(zip(*(layer.table[name].to_pylist() for name in ("sign_id", "sign_class")), strict=True)) == {
+        "2": "unspecified",
+        "498763468214164": "yield",
+    }
+    assert layer.table["first_seen"].drop_null().to_pylist() == [datetime(2014, 5, 13, 11, 28, 10, tzinfo=UTC)]
+    read = list(read_detections(path))
+    assert [lonlat(one.table)[0].tolist() for one in read] == [[LON]]
+    assert [one.skipped for one in read] == [{"class missing": 1}]
+
+
+def test_elements_of_openstreetmap_in_a_list_are_read_by_their_tags(write):
+    node = {"type": "node", "id": 1, "lat": LAT, "lon": LON, "tags": {"traffic_sign": "DE:206"}}
+    assert read_signs(write(json.dumps([node]), "signs.json")).table["sign_class"].to_pylist() == ["stop"]
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ('[{"a": 1}, 2]', "not a list of objects"),
+        ('{"data": [{"a": 1}', "damaged or not json"),
+        ("[" + '{"a":' * 3000 + "1" + "}" * 3000 + "]", "nested too deeply|damaged or not json|looks like the code"),
+        (json.dumps([{f"k{n}": 1} for n in range(1001)]), "1001 different names"),
+    ],
+)
+def test_json_that_is_no_rows_gives_one_message(write, text, why):
+    with pytest.raises(InputError, match=why):
+        read_signs(write(text, "signs.json"))
