@@ -130,7 +130,9 @@ def _written(features: Features, chosen: InventoryColumns, skipped: Counter[str]
 
 def geometry_reader(text: str) -> Callable[..., Any]:
     """Return shapely's function for a text that is GeoJSON, well-known bytes in hexadecimal digits, or text."""
-    return shapely.from_geojson if text.startswith("{") else shapely.from_wkb if _HEX.match(text) else shapely.from_wkt
+    read: Callable[..., Any]
+    read = shapely.from_geojson if text.startswith("{") else shapely.from_wkb if _HEX.match(text) else shapely.from_wkt
+    return read
 
 
 def _shape(text: str) -> Any:
