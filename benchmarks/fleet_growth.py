@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--scenario", default="paper")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--sizes", nargs="+", type=int, default=[20, 50, 100, 200, 500, 2000])
-    parser.add_argument("--shares", nargs="+", type=float, default=[0.0, 0.8])
+    parser.add_argument("--shares", nargs="+", type=float, default=[0.0, 0.7])
     parser.add_argument("--replicates", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=Path, default=RAW / "helsinki_derived.pos")

@@ -264,9 +264,9 @@ def largest_count(xy, eps_m):
 def test_a_core_rule_that_follows_the_densest_place_splits_what_a_fixed_one_chains(n_passes, gap_m):
     xy, lon, lat = chain(np.random.default_rng(0), n_passes, gap_m)
     assert dbscan(xy, 4.0, 3).max() == 0  # one chain
-    split = split_chains(lon, lat, np.zeros(len(lon), np.int64), eps_m=4.0, min_samples=3, share=0.8)
+    split = split_chains(lon, lat, np.zeros(len(lon), np.int64), eps_m=4.0, min_samples=3, share=0.7)
     most = largest_count(xy, 4.0)
-    assert same_groups(split, dbscan(xy, 4.0, math.ceil(0.8 * most - 2 * math.sqrt(most))))
+    assert same_groups(split, dbscan(xy, 4.0, math.ceil(0.7 * most - 2 * math.sqrt(most))))
     first, second = (xy[split == label, 0] for label in np.unique(split[split >= 0]))
     assert sorted((round(first.mean() / gap_m, 1), round(second.mean() / gap_m, 1))) == [0.0, 1.0]
 
@@ -276,8 +276,8 @@ def test_the_rule_has_no_scale():
     xy, lon, lat = chain(np.random.default_rng(1), 200)
     wide_lon, wide_lat = EnuFrame(24.9, 60.2).to_lonlat(3 * xy)
     one = np.zeros(len(lon), np.int64)
-    split = split_chains(lon, lat, one, eps_m=4.0, min_samples=3, share=0.8)
-    assert same_groups(split, split_chains(wide_lon, wide_lat, one, eps_m=12.0, min_samples=3, share=0.8))
+    split = split_chains(lon, lat, one, eps_m=4.0, min_samples=3, share=0.7)
+    assert same_groups(split, split_chains(wide_lon, wide_lat, one, eps_m=12.0, min_samples=3, share=0.7))
 
 
 def test_a_wide_sign_stays_one():
@@ -291,9 +291,9 @@ def test_a_wide_sign_stays_one():
 
 
 def test_few_detections_leave_clusters_as_they_are():
-    _, lon, lat = chain(np.random.default_rng(0), 6)  # 12 members: at most ceil(9.6 - 6.9) = 3 make a core
+    _, lon, lat = chain(np.random.default_rng(0), 6)  # 12 members: at most ceil(8.4 - 6.9) = 2 make a core
     clusters = np.full(12, 4)
-    assert split_chains(lon, lat, clusters, eps_m=4.0, min_samples=3, share=0.8) is clusters
+    assert split_chains(lon, lat, clusters, eps_m=4.0, min_samples=3, share=0.7) is clusters
     _, lon, lat = chain(np.random.default_rng(0), 600)
     clusters = np.full(1200, 4)
     assert split_chains(lon, lat, clusters, eps_m=4.0, min_samples=3, share=0.0) is clusters
