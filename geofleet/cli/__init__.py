@@ -6,16 +6,12 @@ stand in `options`, what is printed in `output`; each other module holds a group
 
 from __future__ import annotations
 
-import gc
 import sys
 
 import typer
 
 from geofleet.cli import ingest, pipeline, study, tables
 from geofleet.errors import GeofleetError, InputError
-
-# Imports make a hundred thousand objects that stay. Python looks through them all again every 700 by default.
-_OBJECTS_A_COLLECTION = 50_000
 
 app = typer.Typer(
     name="geofleet",
@@ -33,7 +29,6 @@ app.add_typer(study.app)
 
 def main() -> None:
     """Run the command line; every expected fault ends in one message and exit code 2."""
-    gc.set_threshold(_OBJECTS_A_COLLECTION)
     try:
         app()
     except GeofleetError as error:
