@@ -15,6 +15,7 @@ _LIST = re.compile(rb'\[\s*\{|\{\s*"data"\s*:\s*\[')
 _LINES = re.compile(rb"\{[^\n]*\}\s*\n\s*\{")
 _FEATURE = re.compile(rb'"type"\s*:\s*"Feature')
 _MAX_COLUMNS = 1000
+_MAX_BYTES = 256 << 20  # held as a whole, in some ten times the room
 
 
 def detect(text: bytes) -> bool:
@@ -30,8 +31,10 @@ def read_records(path: Path) -> pa.Table:
     Raises
     ------
     ValueError
-        The file is not JSON in UTF-8, or not made of objects.
+        The file is not JSON in UTF-8, not made of objects, or too large to be held as a whole.
     """
+    if path.stat().st_size > _MAX_BYTES:
+        raise ValueError(f"larger than {_MAX_BYTES >> 20} MiB: give CSV or Parquet")
     text = path.read_text(encoding="utf-8-sig")
     try:
         content = _content(text)

@@ -247,3 +247,11 @@ def test_elements_of_openstreetmap_in_a_list_are_read_by_their_tags(write):
 def test_json_that_is_no_rows_gives_one_message(write, text, why):
     with pytest.raises(InputError, match=why):
         read_signs(write(text, "signs.json"))
+
+
+def test_json_that_would_fill_the_memory_is_refused(write):
+    path = write('[{"a": 1},', "signs.json")
+    with path.open("r+b") as file:
+        file.truncate(257 << 20)  # takes no room on the disk
+    with pytest.raises(InputError, match="larger than 256 MiB"):
+        read_signs(path)
