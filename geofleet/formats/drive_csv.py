@@ -184,7 +184,7 @@ def _times(
         t_utc, elapsed_s = times_of(text, chosen, day_first=layout.day_first)
         if chosen == "iso":
             n_bad = int((text.notna() & np.isnat(t_utc)).sum())
-            n_bare = 0 if "utc" in names["time"].lower() else n_without_zone(text) - n_bad
+            n_bare = 0 if "utc" in names["time"].lower() else n_without_zone(text[~np.isnat(t_utc)])
             told |= {"times without a zone, taken as UTC": n_bare, f"times that cannot be read{_DAY_OR_MONTH}": n_bad}
         return t_utc, elapsed_s, {name: n for name, n in told.items() if n}
     if "speed" in names:

@@ -29,6 +29,8 @@ _NAMES = {
     "time": "tutc utc utime timestamp timestampns unixtime datetime time gpstime timeutc epoch zeit zeitstempel heure "
     "t",
     "date": "date datum",
+    "week": "week gpsweek weeknumber wn",
+    "tow": "tow gpstow sow gpssow timeofweek",
     "x": "lon longitude lng long londeg lngdeg longitudedeg längengrad laengengrad länge laenge",
     "y": "lat latitude latdeg latitudedeg breitengrad breite",
     "height": "ellipsoidheight ellipsoidalheight heightellipsoidal heightm height",
@@ -38,6 +40,7 @@ _NAMES = {
     "sigma_n": "sigmanm sigman sdn sdnm",
     "drive": "driveid drive tripid trip trackid vehicleid vehicle carid deviceid",
 }
+_BLANKS = r"\s+"
 # What a name may have around it: `%time,field.latitude` of rostopic, and units that change nothing
 _AROUND = re.compile(r"^(?:%|field\.)|\s*[(\[](?:s|sec|deg|degrees|°|m)[)\]]$", re.IGNORECASE)
 # Of coordinates that are not degrees, which only a CRS can tell
@@ -86,10 +89,11 @@ class Layout:
 def detect(head: bytes) -> bool:
     """Tell whether a file's first line fits a profile, or names a time and a position in degrees."""
     line, _ = _first_line(head)
-    if _profile(line, _split(line)):
+    header, _ = _header(line)
+    if _profile(line, header):
         return True
-    guessed = _guess(_split(line), {}, is_projected=False)
-    return {"x", "y", "time"} <= guessed.keys()
+    guessed = _guess(header, {}, is_projected=False)
+    return {"x", "y"} <= guessed.keys() and bool({"time", "tow"} & guessed.keys())
 
 
 @cache
@@ -124,8 +128,7 @@ def layout_of(path: Path, columns: Mapping[str, str] | Path | None, *, is_projec
     """
     given, options = _given(columns)
     line, n_before = _first_line(read_head(path))
-    delimiter = str(options.get("delimiter") or delimiter_of(line))
-    header = _split(line, delimiter)
+    header, delimiter = _header(line, str(options.get("delimiter") or ""))
     name = _profile(line, header)
     profile = profiles()[name] if name else {}
     names = tuple(profile.get("names", ()))
@@ -151,7 +154,7 @@ def layout_of(path: Path, columns: Mapping[str, str] | Path | None, *, is_projec
         columns=merged,
         encoding=str(options.get("encoding") or encoding_of(path)),
         n_before=n_before,
-        delimiter=r"\s+" if profile.get("prefix") else delimiter,
+        delimiter=_BLANKS if profile.get("prefix") else delimiter,
         names=names,
         prefix=str(profile.get("prefix", "")),
         crs=options.get("crs") or (None if options.get("origin") else profile.get("crs")),
@@ -208,9 +211,20 @@ def _guess(header: list[str], given: Mapping[str, str], *, is_projected: bool) -
         if name and thing not in given and not (thing == "time" and "tow" in given):
             guessed[thing] = name
             taken.add(name)
+    if "time" in guessed or not {"week", "tow"} <= guessed.keys() | given.keys():
+        guessed = {thing: name for thing, name in guessed.items() if thing not in {"week", "tow"}}
     if "date" in guessed and not {"time", "tow"} & (guessed.keys() | given.keys()):
         guessed["time"] = guessed.pop("date")
     return guessed
+
+
+def _header(line: str, delimiter: str = "") -> tuple[list[str], str]:
+    """Return the names of a first line and what stands between them: blanks where nothing else does and a place is."""
+    found = delimiter or delimiter_of(line)
+    names, words = _split(line, found), line.split()
+    if not delimiter and len(names) == 1 and {"x", "y"} <= _guess(words, {}, is_projected=True).keys():
+        return words, _BLANKS
+    return names, found
 
 
 def _first_line(head: bytes) -> tuple[str, int]:

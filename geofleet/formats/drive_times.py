@@ -26,6 +26,7 @@ _SLOWEST_MPS = 0.1  # a speed of zero between two places would take for ever
 _LEAST_COUNT = {"unix_ns": 1e17, "unix_us": 1e14, "unix_ms": 1e11, "unix_s": 1e8}
 
 
+_NAMED_UTC = r"(?<=\d)\s*(?:UTC|GMT)$"
 _ZONE = r"(?:Z|[+-]\d{2}(?::?\d{2})?|UTC|GMT)\s*$"
 
 
@@ -52,7 +53,7 @@ def times_of(text: pd.Series[str], time_format: str, *, day_first: bool | None =
     Dates are in ISO 8601, or have day, month and year in another order where it is clear; without a zone they are UTC.
     """
     if time_format == "iso":
-        return _dates(text.str.strip(), day_first=day_first), None
+        return _dates(text.str.strip().str.replace(_NAMED_UTC, "Z", regex=True), day_first=day_first), None
     number = numbers_of(text)
     if time_format in _GPS:
         return gpst_to_utc(GPS_EPOCH + microseconds(number * _GPS[time_format])), None

@@ -221,3 +221,28 @@ def test_cars_of_one_file_are_drives_of_their_own(tmp_path):
     lines = "".join(f"v{s % 2},2024-05-01T12:00:{s:02d}Z,{48 + s % 2 + s * 1e-4},11\n" for s in range(10))
     table = read_drive(csv_file(tmp_path, f"vehicle_id,time,lat,lon\n{lines}")).table
     assert table["drive_id"].to_pylist() == ["drive-v0"] * 5 + ["drive-v1"] * 5
+
+
+@pytest.mark.parametrize(
+    ("header", "line"),
+    [
+        ("time,lat,lon", "2024-05-01 12:00:{s:02d} UTC,{lat},11"),
+        ("time,lat,lon", "2024-05-01T12:00:{s:02d}GMT,{lat},11"),
+        ("gps_week,tow,lat,lon", "2312,{tow},{lat},11"),
+        ("time  lat   lon  alt", "{unix}   {lat} 11  512"),
+    ],
+)
+def test_times_and_columns_as_tools_write_them(tmp_path, header, line):
+    lines = "".join(line.format(s=s, lat=48 + s * 1e-4, tow=302418 + s, unix=1714564800 + s) + "\n" for s in range(5))
+    path = csv_file(tmp_path, f"{header}\n{lines}")
+    assert detect(path.read_bytes()) == "csv"
+    layer = read_drive(path)
+    assert layer.table["t_utc"].to_pylist() == [datetime(2024, 5, 1, 12, 0, s, tzinfo=UTC) for s in range(5)]
+    np.testing.assert_allclose(lonlat(layer.table)[1], 48 + np.arange(5) * 1e-4)
+    assert min(layer.found.values()) >= 0
+
+
+def test_times_in_a_zone_that_has_but_a_name_are_told(tmp_path):
+    layer = read_drive(csv_file(tmp_path, "time,lat,lon\n2024-05-01 12:00:00 CEST,48,11\n2024-05-01T12:00:01Z,48,11\n"))
+    assert any(name.startswith("times that cannot be read") and n == 1 for name, n in layer.found.items())
+    assert "times without a zone, taken as UTC" not in layer.found
