@@ -16,6 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from geofleet.cli import app, main, output
+from geofleet.config import SECTIONS
 
 RAW = Path(__file__).parent.parent / "data" / "raw"
 PBF, POS = RAW / "helsinki.osm.pbf", RAW / "helsinki_derived.pos"
@@ -196,6 +197,14 @@ def test_schema_of_a_table(tmp_path):
     result = geofleet("schema", "detections", "--json", cwd=tmp_path)
     assert {"column": "track_id"}.items() <= json.loads(result.stdout)[3].items()
     assert_refused(geofleet("schema", "nothing", cwd=tmp_path), "signs, runs", cwd=tmp_path)
+
+
+def test_schema_of_the_settings_lists_every_key(tmp_path):
+    settings = json.loads(geofleet("schema", "config", "--json", cwd=tmp_path).stdout)
+    assert {name: set(keys) for name, keys in settings.items()} == {
+        name: set(section.model_fields) for name, section in SECTIONS.items()
+    }
+    assert "eps_m = 4.0" in geofleet("schema", "config", cwd=tmp_path).stdout
 
 
 @pytest.mark.parametrize(

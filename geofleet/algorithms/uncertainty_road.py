@@ -270,7 +270,7 @@ def _errors_note(name: str, blocks: ub.Blocks) -> str:
     if name in {"mse_m2", "rmse_m"}:
         return ""
     n_errors = int({"precision": fp, "recall": fn}.get(name, fp + fn))
-    few = f"{n_errors} errors among {int(tp + n_errors)} signs are few" if n_errors < _FEW_ERRORS else ""
+    few = f"few errors, {n_errors} among {int(tp + n_errors)} signs" if n_errors < _FEW_ERRORS else ""
     exact = (
         "every matched distance is 0: the localisation part has no interval" if name == "gospa_m" and not sum_sq else ""
     )

@@ -84,6 +84,8 @@ def print_result(result: Any, *, as_json: bool) -> None:
             value = ", ".join(f"{key}: {number}" for key, number in value.items() if number != 0)  # noqa: PLW2901 (text)
         elif isinstance(value, list | tuple):
             value = ", ".join(map(str, value))  # noqa: PLW2901 (text)
+        elif isinstance(value, float):
+            value = f"{value:.2f}"  # noqa: PLW2901 (text)
         if value not in ("", None):
             typer.echo(f"  {name.ljust(width)}  {value}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -109,10 +110,12 @@ def convert(
 
 @app.command()
 def schema(
-    table: Annotated[str | None, typer.Argument(help="Name of a table; all names when left out.")] = None,
+    table: Annotated[
+        str | None, typer.Argument(help="Name of a table; config: every setting; all tables when left out.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Print the columns of a table: type, unit, meaning.
+    """Print the columns of a table: type, unit, meaning. Or every key of a scenario with its default.
 
     Example: geofleet schema detections
     """
@@ -121,6 +124,9 @@ def schema(
 
     names: tuple[str, ...]
     rows: list[tuple[str, ...]]
+    if table == "config":
+        _print_settings(as_json=as_json)
+        return
     if table is None:
         rows = [(s.name, ", ".join(s.key), s.description) for s in SCHEMAS.values()]
         names = ("table", "key", "description")
@@ -134,3 +140,14 @@ def schema(
         print_json([dict(zip(names, row, strict=True)) for row in rows])
     else:
         print_table(names, rows)
+
+
+def _print_settings(*, as_json: bool) -> None:
+    """Print the scenario that all others start from: its comments tell units and meanings."""
+    from geofleet.config import ROOT_SCENARIO, packaged_scenarios
+
+    text = packaged_scenarios()[ROOT_SCENARIO].read_text(encoding="utf-8")
+    if as_json:
+        print_json(tomllib.loads(text))
+    else:
+        typer.echo(text.rstrip())

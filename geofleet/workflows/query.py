@@ -41,7 +41,7 @@ def query(statement: str, data: Path) -> tuple[tuple[str, ...], list[tuple[Any, 
         names = tuple(column[0] for column in result.description or ())
         return names, result.fetchall()
     except duckdb.Error as error:
-        raise QueryError(f"{str(error).strip()}", todo=f"Tables here: {', '.join(views)}.") from None
+        raise QueryError(f"{str(error).strip()}\n", todo=f"Tables here: {', '.join(views)}.") from None
     finally:
         connection.close()
 

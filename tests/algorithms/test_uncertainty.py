@@ -273,7 +273,7 @@ def test_a_map_without_an_error_gets_wilsons_interval():
     intervals = road_intervals(outcomes, block_m=100.0)
     wilson = stats.binomtest(30, 30).proportion_ci(method="wilson")
     assert (intervals["recall"].low, intervals["recall"].high) == pytest.approx((wilson.low, 1.0))
-    assert "0 errors among 30 signs are few" in intervals["recall"].note
+    assert "few errors, 0 among 30 signs" in intervals["recall"].note
     # the errors that 30 signs cannot show are in GOSPA_M's interval: Wilson's end alone lifts it
     assert intervals["gospa_m"].high ** 2 > 0.065 + 2 * (1 / wilson.low - 1)
 

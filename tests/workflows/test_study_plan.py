@@ -75,6 +75,8 @@ def test_signs_never_in_view_put_a_target_out_of_reach(folder, tmp_path):
     assert result.floor.n_never_in_view > 5
     assert result.floor.score < 0.95
     assert any("out of reach whatever the number of passes" in line for line in result.answer)
+    assert f"Of 33 signs, no pass has {result.floor.n_never_in_view} in view" in "\n".join(result.answer)
+    assert "--method" not in result.answer[-1], "no method finds what nobody saw"
     seen = plan(study(folder, "range_m=15", sizes=(4,), in_view=True), parse_target("recall=0.95"), tmp_path / "seen")
     assert seen.floor.n_never_in_view == 0
 
@@ -82,6 +84,7 @@ def test_signs_never_in_view_put_a_target_out_of_reach(folder, tmp_path):
 def test_neighbours_that_clustering_merges_are_counted(folder, tmp_path):
     result = plan(study(folder, "eps_m=12", sizes=(4,), n_replicates=1), parse_target("gospa_m=0.1"), tmp_path)
     assert result.floor.n_merged > 1
+    assert "--method joint" in result.answer[-1]
     assert np.isclose(result.floor.score, np.sqrt(2 * result.floor.n_merged / (33 - result.floor.n_merged)))
 
 

@@ -170,9 +170,9 @@ def _beyond_reach(floor: Floor, target: Target) -> list[str]:
     """Say what no number of passes can find."""
     lost = []
     if floor.n_never_in_view:
-        lost.append(f"{floor.n_never_in_view} that no pass had in view")
+        lost.append(f"no pass has {floor.n_never_in_view} in view")
     if floor.n_merged:
-        lost.append(f"{floor.n_merged} that a clustering may take for a neighbour of their class closer than eps_m")
+        lost.append(f"clustering may merge {floor.n_merged} with a neighbour of the same class closer than eps_m")
     if not lost:
         return []
     out_of_reach = "" if target.is_met(floor.score) else ": the target is out of reach whatever the number of passes"

@@ -137,10 +137,13 @@ def plan(
     fleets = [json.loads(search.path.read_text(encoding="utf-8")) for search in searches]
     needed, floor = sum_up([fleet["needed"] for fleet in fleets], level=level), Floor(**fleets[0]["floor"])
     scores, parts, tiles = score_rows(fleets, target), part_rows(fleets), tile_rows(fleets, target, level)
+    answer = answer_in_words(needed, target, floor, parts, scores)
+    if needed.typical is None and not (study.methods[0].has_passes or floor.n_never_in_view):
+        answer.append("Another method may: --method joint takes out what the detections of a pass have in common.")
     return PlanResult(
         caption=f"{describe(study)}; method {study.methods[0].label}, upload {study.methods[0].upload}",
         target=str(target),
-        answer=tuple(answer_in_words(needed, target, floor, parts, scores)),
+        answer=tuple(answer),
         needed=needed,
         floor=floor,
         scores=tuple(scores),
