@@ -1,8 +1,8 @@
-"""Write docs/results.md and its figures from what the studies found. No number in that page is written by hand.
+"""Write docs/results.md, its figures and the table of the README from what the studies found, no number by hand.
 
     make results        (or: python scripts/write_results.py data/processed/study)
 
-A study that is not there leaves its section as it was.
+A study that is not there leaves its section, or the table, as it was.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from geofleet.workflows.study.fleet_size import PAPER_METHOD
+from geofleet.workflows.study.methods import JOINT, PEAKS
 from geofleet.workflows.study.paper import paper_curve, paper_table
 
 if TYPE_CHECKING:
@@ -24,8 +25,15 @@ if TYPE_CHECKING:
     Row = dict[str, str]
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
+README = DOCS.parent / "README.md"
 FIGURES = DOCS / "figures"
 GOOD_F1 = 0.9  # named in the tables
+README_SIZES = (5, 10, 20, 50)
+README_METHODS = {
+    PAPER_METHOD: "the same method here",
+    PEAKS: "`geofleet aggregate`",
+    JOINT: "`geofleet aggregate --method joint`",
+}
 HEAD = """# Results
 
 Written by `make results` from the output of `make study` and `make environments`; no number here is written by hand.
@@ -43,6 +51,30 @@ def main() -> None:
     old = path.read_text(encoding="utf-8") if path.is_file() else ""
     sections = [section(name, render, folder / name, old) for name, render in SECTIONS.items()]
     path.write_text("\n".join([HEAD, *filter(None, sections)]), encoding="utf-8")
+    if (folder / "fleet-size" / "_manifest.json").is_file():
+        mark, end = "<!-- fewer cars, by make results -->\n", "<!-- end of fewer cars -->"
+        before, _, rest = README.read_text(encoding="utf-8").partition(mark)
+        _, _, after = rest.partition(end)
+        text = f"{before}{mark}{fewer_cars(read_summary(folder / 'fleet-size'))}\n{end}{after}"
+        README.write_text(text, encoding="utf-8")
+
+
+def fewer_cars(rows: list[Row]) -> str:
+    """Return the table of the README: what fleets of some sizes reach, the paper's and by three methods."""
+    paper = {(p.n_vehicles, p.score): p.mean for name in ("f1", "gospa_m") for p in paper_curve(name)}
+    lines = [
+        ["the paper, DBSCAN, as printed", *(f"{paper[v, 'f1']:.3f}, {paper[v, 'gospa_m']:.3f}" for v in README_SIZES)]
+    ]
+    for method, what in README_METHODS.items():
+        cells = [
+            ", ".join(
+                f"{float(score(rows, name, method=method, n_vehicles=str(v))['mean']):.3f}"
+                for name in ("f1", "gospa_m")
+            )
+            for v in README_SIZES
+        ]
+        lines.append([what, *cells])
+    return table(["F1 and GOSPA_M (m) with", *(f"{v} cars" for v in README_SIZES)], lines)
 
 
 def section(name: str, render: Callable[[list[Row]], str], study: Path, old: str) -> str:
@@ -54,9 +86,14 @@ def section(name: str, render: Callable[[list[Row]], str], study: Path, old: str
         return kept[0] if kept else ""
     for figure in study.glob("*.svg"):
         shutil.copyfile(figure, FIGURES / figure.name)
-    with (study / "summary.csv").open(encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = read_summary(study)
     return f"{begin}\n{render(rows)}\n\n*{provenance(study, rows)}*\n{end}\n"
+
+
+def read_summary(study: Path) -> list[Row]:
+    """Return the rows of a study's summary."""
+    with (study / "summary.csv").open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
 
 
 def provenance(study: Path, rows: list[Row]) -> str:

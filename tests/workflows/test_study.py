@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -219,12 +220,19 @@ def test_impossible_studies_are_refused(inputs):
         run_study(small(inputs), Path("unused-study"), n_workers=0)
 
 
-def test_the_page_of_results_is_written_from_the_output(inputs, tmp_path, repo, monkeypatch):
+@pytest.fixture
+def write_results(repo):
     spec = importlib.util.spec_from_file_location("write_results", repo / "scripts" / "write_results.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_of_results_is_written_from_the_output(inputs, tmp_path, write_results, monkeypatch):
+    module = write_results
     monkeypatch.setattr(module, "DOCS", tmp_path)
     monkeypatch.setattr(module, "FIGURES", tmp_path / "figures")
+    monkeypatch.setattr(module, "README", tmp_path / "README.md")
     monkeypatch.setattr(sys, "argv", ["write_results.py", str(tmp_path / "study")])
     result = compare(small(inputs, "dbscan,dbscan-corrected", sizes=(5,), n_replicates=3), tmp_path / "study")
     module.main()
@@ -237,6 +245,19 @@ def test_the_page_of_results_is_written_from_the_output(inputs, tmp_path, repo, 
     shutil.rmtree(tmp_path / "study")
     module.main()
     assert (tmp_path / "results.md").read_text(encoding="utf-8") == page, "what has not been run stays as it was"
+
+
+def test_the_table_of_the_readme_is_that_of_the_study(write_results):
+    """No number there is written by hand."""
+    module = write_results
+    text = module.README.read_text(encoding="utf-8")
+    found = re.search(r"<!-- fewer cars, by make results -->\n(.*?)\n<!-- end of fewer cars -->", text, flags=re.DOTALL)
+    page = (module.DOCS / "results.md").read_text(encoding="utf-8")
+    lines = found[1].splitlines()
+    assert len(lines) == 3 + len(module.README_METHODS)
+    for line in lines[2:]:
+        for f1, gospa_m in re.findall(r"(\d\.\d{3}), (\d\.\d{3})", line):
+            assert re.search(rf"\| {f1} \| {gospa_m} ±", page), line
 
 
 def test_a_fleet_alone_has_the_detections_it_has_among_others(inputs, tmp_path):
