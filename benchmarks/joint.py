@@ -23,7 +23,7 @@ import numpy as np
 from joint_cases import PRIOR_CASES, ROBUSTNESS
 from joint_cost import measure_cost
 from joint_fleets import DRIVE_FILES, SEED, Case, runs, simulated
-from joint_honesty import Honesty, covered
+from joint_honesty import Honesty, covered, faults
 from joint_maps import (
     dbscan,
     joint,
@@ -187,6 +187,7 @@ def robustness(fleets: Path, name: str, n_replicates: int, vehicles: tuple[int, 
     tables = {v: Table() for v in vehicles}
     coverage: dict[int, list[float]] = {v: [] for v in vehicles}
     settled: dict[int, list[bool]] = {v: [] for v in vehicles}
+    named = {v: np.zeros(4, np.int64) for v in vehicles}
     for number, whole in runs(fleets, case, n_replicates):
         if number % case.batch == 0:
             at = simulated(fleets, case, number)
@@ -200,11 +201,13 @@ def robustness(fleets: Path, name: str, n_replicates: int, vehicles: tuple[int, 
             tables[v].add(rival, score_dbscan(run, maps[v]))
             coverage[v].append(covered(run, fused))
             settled[v].append(fused.is_settled)
+            named[v] += faults(run, fused)
     found = {
         str(v): {
             **table.summary(),
             "coverage_90": float(np.nanmean(coverage[v])),
             "settled": float(np.mean(settled[v])),
+            "named": dict(zip(("faulty", "faulty named", "sound", "sound named"), named[v].tolist(), strict=True)),
         }
         for v, table in tables.items()
     }

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from joint_maps import accepted, own_sign, without_translation
 
+from geofleet.algorithms.joint_search import believed
+from geofleet.engines.joint import SUSPECT_NOISE
+
 if TYPE_CHECKING:
     from joint_fleets import Run
     from joint_maps import Known
@@ -33,6 +36,16 @@ def covered(run: Run, fused: JointMap) -> float:
     """Return the share of signs within their 90 % ellipse."""
     chi2 = errors(run, fused)[1]
     return float((chi2 <= CHI2_90).mean()) if len(chi2) else float("nan")
+
+
+def faults(run: Run, fused: JointMap) -> NDArray[np.int64]:
+    """Return how many passes are faulty, and named as such; how many are sound, and named: (4,)."""
+    declared, faulty = run.fleet.passes, np.array(run.passes["sensor_kind"].to_pylist()) == "faulty"
+    # by what `geofleet aggregate` names them by: offset or biases that it does not believe, or noise
+    found = believed(declared, fused.nuisance, len(faulty))
+    named = (found.gnss_sigma_m > declared.gnss_sigma_m) | (found.bias_sigma > declared.bias_sigma).any(axis=1)
+    named |= fused.noise_factor[: len(faulty)] > SUSPECT_NOISE
+    return np.array([faulty.sum(), (faulty & named).sum(), (~faulty).sum(), (~faulty & named).sum()])
 
 
 @dataclass
