@@ -1,6 +1,7 @@
 """Measure joint fusion beside DBSCAN, the known association and the Cramér-Rao bound, on simulated fleets.
 
     .venv/bin/python benchmarks/joint.py bars --drive A --replicates 200
+    .venv/bin/python benchmarks/joint.py rivals --drive A --replicates 60            (DBSCAN on the same fleets)
     .venv/bin/python benchmarks/joint.py bars --drive B --seed 7 --replicates 20      (a seed nobody looked at)
     .venv/bin/python benchmarks/joint.py prior | robustness | cost
     make fusion-table                                                (`study compare`, then `joint.py table`)
@@ -47,8 +48,6 @@ VEHICLES = (1, 2, 3, 5, 8, 10, 15, 20, 30, 50)
 KALMAN = {"tracker": "kalman"}
 WITH_PRIOR = (1, 3, 50)
 """Fleets that are also given a stale prior."""
-N_PLAIN = 20
-"""Replicates of DBSCAN on plain means: the rival is the corrected one."""
 N_BOOTSTRAP = 2000
 RIVALS = {"dbscan": "dbscan-first", "dbscan by default": "dbscan-peaks", "dbscan corrected": "dbscan-corrected"}
 """DBSCAN as the paper has it, and with a core rule that follows the fleet, without and with biases taken out."""
@@ -108,21 +107,16 @@ def paired(ours: Scores, theirs: Scores) -> dict[str, float]:
 
 
 def bars(
-    fleets: Path, case: Case, n_replicates: int, n_dbscan: int, vehicles: tuple[int, ...]
+    fleets: Path, case: Case, n_replicates: int, vehicles: tuple[int, ...]
 ) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Score every method at every fleet size; and how honest joint fusion is about its errors. A batch at a time.
+    """Score joint fusion at every fleet size; and how honest it is about its errors. A batch at a time.
 
     What a batch found is kept beside the fleets: a run that was stopped goes on, with the same program.
     """
     sizes = "-".join(map(str, vehicles))
-    kept = fleets / f"bars-{case.name}-{n_dbscan}-{sizes}-{code_digest()}.pickle"
+    kept = fleets / f"bars-{case.name}-{sizes}-{code_digest()}.pickle"
     done, tables, honesty, unsettled = _begun(kept, vehicles)
     for number, whole in runs(fleets, case, n_replicates, first=done):
-        if number < n_dbscan and number % case.batch == 0:
-            at = simulated(fleets, case, number)
-            informed = case.settings.get("tracker") == "kalman"  # the fair rival where tracks tell their bias
-            ways = (("dbscan",) if number < N_PLAIN else ()) + (("dbscan corrected",) if informed else ())
-            maps = {(v, way): dbscan(at, case, v, RIVALS[way]) for v in vehicles for way in ways}
         for v in vehicles:
             run = whole.first_vehicles(v)
             fused = joint(run)
@@ -136,16 +130,31 @@ def bars(
                 prior, judged = stale_prior(run, whole.in_view, seed=case.seed + number)
                 tables[v].add("joint with a stale prior", score_joint(judged, joint(run, prior)))
                 tables[v].add("stale prior alone", score_prior(judged, prior))
-            if number < n_dbscan:
-                for (size, way), found in maps.items():
-                    if size == v:
-                        tables[v].add(way, score_dbscan(run, found))
         if (number + 1) % case.batch == 0:
             for v in vehicles:
                 print(number + 1, v, _short(tables[v].summary()), unsettled[v], flush=True)
             kept.write_bytes(pickle.dumps((number + 1, tables, honesty, unsettled)))
             scores = {str(v): {**table.summary(), "unsettled": unsettled[v]} for v, table in tables.items()}
             yield scores, {str(v): honesty[v].summary() for v in vehicles}
+
+
+def rivals(fleets: Path, case: Case, n_replicates: int, vehicles: tuple[int, ...]) -> dict[str, Any]:
+    """Score DBSCAN, and joint fusion beside it on the same runs; its maps are kept beside the fleets."""
+    # the fair rival where tracks tell their bias
+    labels = ("dbscan", "dbscan corrected") if case.settings.get("tracker") == "kalman" else ("dbscan",)
+    tables = {v: Table() for v in vehicles}
+    for number, whole in runs(fleets, case, n_replicates):
+        if number % case.batch == 0:
+            at = simulated(fleets, case, number)
+            maps = {(v, label): dbscan(at, case, v, RIVALS[label]) for v in vehicles for label in labels}
+        for v in vehicles:
+            run = whole.first_vehicles(v)
+            tables[v].add("joint", score_joint(run, joint(run)))
+            for label in labels:
+                tables[v].add(label, score_dbscan(run, maps[v, label]))
+    for v, table in tables.items():
+        print(v, _short(table.summary()), flush=True)
+    return {str(v): {k: of for k, of in table.summary().items() if k != "joint"} for v, table in tables.items()}
 
 
 def _begun(kept: Path, vehicles: tuple[int, ...]) -> tuple[int, dict[int, Table], dict[int, Honesty], dict[int, int]]:
@@ -239,11 +248,12 @@ def _short(row: dict[str, Any]) -> str:
 
 
 def keep(section: str, name: str, figures: Any, *, is_part: bool = False) -> None:
-    """Put figures into the results, beside those of other commands; with `is_part`, beside those of other sizes."""
+    """Put figures into the results, beside those of other commands; with `is_part`, also of other sizes and methods."""
     RESULTS.parent.mkdir(exist_ok=True)
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     of_section = results.setdefault(section, {})
-    of_section[name] = of_section.get(name, {}) | figures if is_part else figures
+    before = of_section.get(name, {}) if is_part else {}
+    of_section[name] = before | {key: before.get(key, {}) | of for key, of in figures.items()} if is_part else figures
     RESULTS.write_text(json.dumps(_rounded(results), indent=1, sort_keys=True) + "\n")
 
 
@@ -257,13 +267,12 @@ def _rounded(value: Any) -> Any:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("bars", "table", "prior", "robustness", "cost"))
+    parser.add_argument("what", choices=("bars", "rivals", "table", "prior", "robustness", "cost"))
     parser.add_argument("--fleets", type=Path, default=Path("data/processed/benchmark-fleets"))
     parser.add_argument("--drive", choices=("A", "B"), default="A")
     parser.add_argument("--scenario", default="paper-ideal")
     parser.add_argument("--tracker", default="kalman")
     parser.add_argument("--replicates", type=int, default=200)
-    parser.add_argument("--dbscan-replicates", type=int, default=200)
     parser.add_argument("--vehicles", type=int, nargs="+")
     parser.add_argument("--cases", nargs="*", default=[])
     parser.add_argument("--seed", type=int, default=SEED)
@@ -272,14 +281,16 @@ def main() -> None:
     given = parser.parse_args()
     case = Case(given.scenario, given.drive, {"tracker": given.tracker}, given.largest, seed=given.seed)
     name = f"{given.scenario}, {given.tracker}, {given.drive}"
+    is_usual = given.seed == SEED
+    section, name = ("bars", name) if is_usual else ("fresh", f"{name}, seed {given.seed}")
+    sizes = tuple(given.vehicles or VEHICLES)
     if given.what == "bars":
-        sizes = tuple(given.vehicles or VEHICLES)
-        for scores, honesty in bars(given.fleets, case, given.replicates, given.dbscan_replicates, sizes):
-            if given.seed == SEED:
-                keep("bars", name, scores, is_part=True)
+        for scores, honesty in bars(given.fleets, case, given.replicates, sizes):
+            keep(section, name, scores, is_part=True)
+            if is_usual:
                 keep("honesty", name, honesty, is_part=True)
-            else:
-                keep("fresh", f"{name}, seed {given.seed}", scores, is_part=True)
+    elif given.what == "rivals":
+        keep(section, name, rivals(given.fleets, case, given.replicates, sizes), is_part=True)
     elif given.what == "table":
         for world, by_size in shown(given.study).items():
             keep("table", world, by_size)

@@ -61,9 +61,9 @@ wrong weighs heavily; the ratio of medians stands beside it. Normalised error sq
 HARD = """DBSCAN corrected and joint have the same detections; of means alone DBSCAN takes no bias out.
 Mean F1 / median GOSPA_M (m). `benchmarks/joint_cases.py` lists what is set.
 """
-NAMED = """Faulty passes that the command names, and sound ones. Of what `paper-ideal` declares, 10 m and 5° are no more than 3.4
-standard deviations, and of offsets drawn with 10 m a good part is small: these cannot be told. A pass that no other
-meets is named too, and not counted here.
+NAMED = """Faulty passes that the command names, and sound ones. Of what `paper-ideal` declares, 10 m and 5° are no more
+than 3.4 standard deviations, and of offsets drawn with 10 m a good part is small: these cannot be told. A pass that
+no other meets is named too, and not counted here.
 """
 
 
