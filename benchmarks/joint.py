@@ -282,7 +282,8 @@ def main() -> None:
     case = Case(given.scenario, given.drive, {"tracker": given.tracker}, given.largest, seed=given.seed)
     name = f"{given.scenario}, {given.tracker}, {given.drive}"
     is_usual = given.seed == SEED
-    section, name = ("bars", name) if is_usual else ("fresh", f"{name}, seed {given.seed}")
+    largest = "" if given.largest == Case.n_vehicles else f", {given.largest} at most"
+    section, name = ("bars", name) if is_usual else ("fresh", f"{name}, seed {given.seed}{largest}")
     sizes = tuple(given.vehicles or VEHICLES)
     if given.what == "bars":
         for scores, honesty in bars(given.fleets, case, given.replicates, sizes):
