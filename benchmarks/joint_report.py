@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 DOCS = Path(__file__).parent.parent / "docs"
+SCENARIOS = ("paper-ideal", "paper", "paper-50m")
+METHODS = ("dbscan-first", "dbscan-corrected", "joint")
 HEAD = """# Joint fusion, measured
 
 **All fleets below are simulated** (`benchmarks/joint.py`; this page is written by `benchmarks/joint_report.py` from
@@ -145,8 +147,8 @@ def _paired(bars: dict[str, Any]) -> str:
 def _study(table: dict[str, Any]) -> str:
     """Return what `study compare` found, a table a scenario and drive."""
     parts = []
-    for world, by_size in table.items():
-        methods = list(next(iter(by_size.values())))
+    for world, by_size in sorted(table.items(), key=lambda item: SCENARIOS.index(item[0].split(",")[0])):
+        methods = sorted(next(iter(by_size.values())), key=METHODS.index)
         rows = [[v, *(_means(by_size[v][method]) for method in methods)] for v in sorted(by_size, key=int)]
         parts.append(f"### {world}\n\n" + _table(("passes", *(f"`{method}`" for method in methods)), rows))
     return "\n".join(parts)
