@@ -216,6 +216,7 @@ def test_schema_of_the_settings_lists_every_key(tmp_path):
         (("plan", "--target", "gospa_m"), "Example: gospa_m=0.5"),
         (("plan", "--target", "f1=0.9", "--method", "dbscan,kmeans"), "one drive, one scenario and one method"),
         (("plan", "--target", "f1=0.9", "--confidence", "1.5"), "--confidence: the level is 1.5"),
+        (("plan", "--target", "f1=0.9", "--method", "joint-prior", "--prior", "no.gpkg"), "no.gpkg: there is no such"),
     ],
 )
 def test_a_study_that_cannot_be(arguments, says, tables, tmp_path):

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from geofleet.steps.report.study import Study
 
 FONT = "system-ui, sans-serif"
+_MARKS = ("circle", "square", "triangle", "inverted_triangle", "hex", "star")
+_DASHES = ("solid", "dashed", "dashdot", "dotted", "dotdash", [8, 2])
 INK, FAINT = "#333333", "#E8E8E8"
 _TIP = """
 <div style="font: 13px/1.45 system-ui, sans-serif; margin: 2px 0 6px">
@@ -224,13 +226,13 @@ def draw_curves(study: Study, score: str) -> Model:
     )
     _style(plot)
     curves = [curve for curve in study.curves if curve.score == score]
-    for curve, colour in zip(curves, cycle(SERIES), strict=False):
+    for curve, colour, mark, dash in zip(curves, cycle(SERIES), cycle(_MARKS), cycle(_DASHES), strict=False):
         x, label = curve.n_vehicles, f"{curve.name}, {curve.n_runs} runs"
         plot.varea(x, curve.low, curve.high, color=colour, alpha=0.2, legend_label=label)
         plot.segment(x, curve.mean - curve.sd, x, curve.mean + curve.sd, color=colour, alpha=0.6, legend_label=label)
-        plot.line(x, curve.mean, color=colour, line_width=2.5, legend_label=label)
+        plot.line(x, curve.mean, color=colour, line_dash=dash, line_width=2.5, legend_label=label)
         source = {"x": x, "y": curve.mean, "sd": curve.sd, "name": [curve.name] * len(x)}
-        dots = plot.scatter("x", "y", source=source, color=colour, size=7, legend_label=label)
+        dots = plot.scatter("x", "y", source=source, color=colour, marker=mark, size=8, legend_label=label)
         tips = [("", "@name"), ("vehicles", "@x"), (SCORE_LABELS[score], "@y{0.000}"), ("sd", "@sd{0.000}")]
         plot.add_tools(HoverTool(renderers=[dots], tooltips=tips, visible=False))
     if score in study.paper:

@@ -259,7 +259,7 @@ def _provenance(contents: Contents) -> list[str]:
     """Say what is real and what is not."""
     sentences = []
     if contents.run is not None:
-        sentences.append("The detections are simulated; the signs they are of are those of the reference.")
+        sentences.append("The detections are simulated, of the signs of the reference.")
     else:
         sentences.append("No table here says that anything was simulated.")
     if contents.is_drive_derived:

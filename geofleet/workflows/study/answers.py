@@ -90,7 +90,8 @@ def part_rows(fleets: Sequence[dict[str, Any]], tile: str = "all") -> list[dict[
     """Return a row a part of GOSPA_M²: its mean over fleets, m² a matched sign, and its share."""
     totals = [row for fleet in fleets for row in fleet["parts"] if row["tile"] == tile]
     tp = sum(row["tp"] for row in totals)
-    sums = {name: sum(row[name] for row in totals) for name in PARTS}
+    # in one tile what is left of the errors beside the common offset may lie below zero
+    sums = {name: max(sum(row[name] for row in totals), 0.0) for name in PARTS}
     whole = sum(sums.values())
     return [
         {"part": name, "what": PARTS[name], "m2": value / tp if tp else None, "share": value / whole if whole else 0.0}

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from geofleet.algorithms.staleness import Staleness
 from geofleet.config import load_config
-from geofleet.errors import ConfigError
+from geofleet.errors import ConfigError, InputError
 from geofleet.formats.layers import read_layer
 from geofleet.steps.ingest import ingest_drive
 from geofleet.tables.manifest import hash_path
@@ -85,6 +85,8 @@ class Study:
             raise ConfigError(f"{self.n_replicates} replicates.", where="--replicates", todo="Give 1 or more.")
         if self.prior is not None and not any(method.has_prior for method in self.methods):
             raise ConfigError("no method here starts from a prior map.", where="--prior", todo="Name joint-prior.")
+        if self.prior is not None and not self.prior.exists():
+            raise InputError("there is no such file.", where=str(self.prior), todo="Check the path.")
 
 
 def prepare_worlds(
@@ -130,7 +132,7 @@ def prepare_worlds(
     table = as_signs_table(signs, folder)
     worlds = []
     for number, drive in enumerate(drives):
-        path = as_drives_table(drive, folder / f"drive-{number}.parquet")
+        path = as_drives_table(drive, folder / f"{drive.name.partition('.')[0]}-drive-{number}.parquet")
         place = ", ".join(pc.unique(read_table(DRIVES, path, columns=["drive_id"])["drive_id"]).to_pylist())
         worlds += [World(place, change, table, path, config) for change, config in configs]
     return tuple(worlds)
@@ -140,7 +142,7 @@ def as_signs_table(path: Path, folder: Path) -> Path:
     """Return a `signs` table of a map: itself when it is one, else a new one in a folder."""
     if _is_table(path, SIGNS.name):
         return path
-    out = folder / "signs.parquet"
+    out = folder / f"{path.name.partition('.')[0]}-signs.parquet"  # messages name it
     write_table(SIGNS, read_layer(path).table.combine_chunks(), out)
     return out
 
