@@ -30,6 +30,7 @@ LINES = {  # method: colour, mark, dash, name
     "joint with a stale prior": (GREEN, "^", "-", "joint with a stale prior"),
 }
 MOST_M = 5.0
+CORNER = 0.02
 
 
 def draw_fleet_sizes(bars: dict[str, Any], path: Path) -> None:
@@ -53,9 +54,16 @@ def draw_fleet_sizes(bars: dict[str, Any], path: Path) -> None:
                 axis.minorticks_off()
             left.set(ylabel="median GOSPA_M (m)", yscale="log")
             left.axhline(0.78, color=VERMILLION, linewidth=0.8)
-            left.annotate("the paper at 50: 0.78 m", (1, 0.8), color=VERMILLION, fontsize=7)
+            left.annotate("the paper at 50: 0.78 m", (1, 0.74), color=VERMILLION, fontsize=7, va="top")
+            _plain_ticks(left, (0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
             right.set(ylabel="mean F1", ylim=(0, 1.03))
         axes[0, 1].legend(fontsize=7, loc="lower right")
+
+
+def _plain_ticks(axes: Axes, ticks: tuple[float, ...]) -> None:
+    """Mark these values of a logarithmic axis as people read them."""
+    axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_yticks([], minor=True)
 
 
 def draw_reliability(honesty: dict[str, Any], path: Path) -> None:
@@ -72,10 +80,13 @@ def draw_reliability(honesty: dict[str, Any], path: Path) -> None:
                     [b["true"] for b in bins],
                     marker=mark,
                     color=colour,
-                    label=f"{v} passes",
+                    label=f"{v} passes; in the corners "
+                    + ", ".join(str(b["n"]) for b in bins if not CORNER < b["stated"] < 1 - CORNER),
                     linestyle="none",
                 )
                 for b in bins:
+                    if not CORNER < b["stated"] < 1 - CORNER:
+                        continue
                     axes.annotate(
                         str(b["n"]), (b["stated"], b["true"]), fontsize=6, xytext=(3, 3), textcoords="offset points"
                     )
@@ -114,6 +125,7 @@ def draw_convergence(fleets: Path, path: Path) -> None:
                 _rms(best.xy_m, run, np.ones(len(best.xy_m), bool)), color=colour, linestyle=":", linewidth=0.9
             )
         axes.set(xlabel="round of association", ylabel="error of relative places (m)", yscale="log")
+        _plain_ticks(axes, (0.02, 0.03, 0.04, 0.06))
         axes.legend(fontsize=8, title="dotted: known association, last replicate", title_fontsize=7)
 
 
