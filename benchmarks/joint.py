@@ -93,7 +93,8 @@ class Table(dict[str, Scores]):
         found: dict[str, dict[str, float]] = {method: scores.summary() for method, scores in self.items()}
         for rival, label in RIVALS.items():
             if rival in self:
-                found["paired"] = paired(self["joint"], self[rival]) | {"core_share": _core_share(label)}
+                share = _core_share(label)
+                found[f"paired at {share:g}"] = paired(self["joint"], self[rival]) | {"core_share": share}
         return found
 
 

@@ -36,9 +36,9 @@ CORNER = 0.02
 def draw_fleet_sizes(bars: dict[str, Any], path: Path) -> None:
     """Draw GOSPA_M and F1 over the number of passes, a row a drive."""
     names = [name for name in bars if name.startswith("paper-ideal, kalman")]
-    n = min(row["joint"]["n"] for name in names for row in bars[name].values())
+    n = min(row["joint"]["n"] for name in names for row in bars[name].values() if "joint" in row)
     n_dbscan = min(row["dbscan"]["n"] for name in names for row in bars[name].values() if "dbscan" in row)
-    caption = f"{SIMULATED}; {n} replicates, of DBSCAN the first {n_dbscan} of them: its medians are of other draws."
+    caption = f"{SIMULATED}; {n} replicates or more, of DBSCAN {n_dbscan}: its medians are of other draws."
     with figure_file(path, caption=caption, size=(9.0, 3.2 * len(names))) as figure:
         axes = figure.subplots(len(names), 2, squeeze=False)
         for (left, right), name in zip(axes, names, strict=True):
