@@ -119,7 +119,10 @@ def _bars(bars: dict[str, Any]) -> str:
             "unsettled",
             "runs",
         )
-        parts.append(f"### {name}\n\nMean F1 / median GOSPA_M (m). Of DBSCAN 20 runs.\n\n" + _table(head, rows))
+        parts.append(
+            f"### {name}\n\nMean F1 / median GOSPA_M (m). Of DBSCAN the first 20 runs, so that its medians are of other\ndraws; the same runs are compared below.\n\n"
+            + _table(head, rows)
+        )
     return "\n".join(parts)
 
 
