@@ -38,7 +38,11 @@ def draw_fleet_sizes(bars: dict[str, Any], path: Path) -> None:
     names = [name for name in bars if name.startswith("paper-ideal, kalman")]
     n = min(row["joint"]["n"] for name in names for row in bars[name].values() if "joint" in row)
     n_dbscan = min(row["dbscan"]["n"] for name in names for row in bars[name].values() if "dbscan" in row)
-    caption = f"{SIMULATED}; {n} replicates or more, of DBSCAN {n_dbscan}: its medians are of other draws."
+    n_rival = max(row[key]["n"] for name in names for row in bars[name].values() for key in row if "paired" in key)
+    caption = (
+        f"{SIMULATED}; {n} replicates or more. Of DBSCAN the first {n_dbscan}, of its\n"
+        f"median with biases taken out the first {n_rival}: these are of other draws."
+    )
     with figure_file(path, caption=caption, size=(9.0, 3.2 * len(names))) as figure:
         axes = figure.subplots(len(names), 2, squeeze=False)
         for (left, right), name in zip(axes, names, strict=True):
@@ -46,7 +50,10 @@ def draw_fleet_sizes(bars: dict[str, Any], path: Path) -> None:
                 sizes = sorted(int(v) for v in bars[name] if method in bars[name][v])
                 style = {"color": colour, "marker": mark, "linestyle": dash, "markersize": 4, "label": label}
                 of = [bars[name][str(v)][method] for v in sizes]
-                left.plot(sizes, [min(row["gospa_m_median"], MOST_M) for row in of], **style)
+                medians = {v: row["gospa_m_median"] for v, row in zip(sizes, of, strict=True)}
+                if method == "dbscan corrected":  # where the draws are many: its medians are set beside those of all
+                    medians = {v: row["rival"] for v in sizes for row in _largest(bars[name][str(v)], n_rival)}
+                left.plot(list(medians), [min(median, MOST_M) for median in medians.values()], **style)
                 right.plot(sizes, [row["f1_mean"] for row in of], **style)
             for axis in (left, right):
                 axis.set(xscale="log", xlabel="passes", title=f"drive {name[-1]}")
@@ -58,6 +65,11 @@ def draw_fleet_sizes(bars: dict[str, Any], path: Path) -> None:
             _plain_ticks(left, (0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
             right.set(ylabel="mean F1", ylim=(0, 1.03))
         axes[0, 1].legend(fontsize=7, loc="lower right")
+
+
+def _largest(row: dict[str, Any], n: int) -> list[dict[str, float]]:
+    """Return the comparison with corrected DBSCAN on so many runs, if there is one."""
+    return [row[key] for key in row if "paired" in key and row[key]["n"] == n][:1]
 
 
 def _plain_ticks(axes: Axes, ticks: tuple[float, ...]) -> None:

@@ -71,6 +71,8 @@ NAMED = """Faulty passes that the command names, and sound ones. Of what `paper-
 than 3.4 standard deviations, and of offsets drawn with 10 m a good part is small: these cannot be told. A pass that
 no other meets is named too, and not counted here.
 """
+OTHER_DRAWS = """Of DBSCAN the first 20 runs, so that its medians are of other draws; the same runs are compared
+below."""
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -119,10 +121,7 @@ def _bars(bars: dict[str, Any]) -> str:
             "unsettled",
             "runs",
         )
-        parts.append(
-            f"### {name}\n\nMean F1 / median GOSPA_M (m). Of DBSCAN the first 20 runs, so that its medians are of other\ndraws; the same runs are compared below.\n\n"
-            + _table(head, rows)
-        )
+        parts.append(f"### {name}\n\nMean F1 / median GOSPA_M (m). {OTHER_DRAWS}\n\n" + _table(head, rows))
     return "\n".join(parts)
 
 
