@@ -36,8 +36,6 @@ from joint_maps import (
     without_common_offset,
 )
 
-from geofleet.config import load_config
-from geofleet.workflows.study.methods import METHODS, with_settings
 from geofleet.workflows.study.worlds import code_digest
 
 if TYPE_CHECKING:
@@ -91,16 +89,10 @@ class Table(dict[str, Scores]):
     def summary(self) -> dict[str, dict[str, float]]:
         """Return the figures of every method."""
         found: dict[str, dict[str, float]] = {method: scores.summary() for method, scores in self.items()}
-        for rival, label in RIVALS.items():
-            if rival in self:
-                share = _core_share(label)
-                found[f"paired at {share:g}"] = paired(self["joint"], self[rival]) | {"core_share": share}
+        rival = next((name for name in reversed(RIVALS) if name in self), None)  # the strongest that was run
+        if rival:
+            found["paired"] = paired(self["joint"], self[rival])
         return found
-
-
-def _core_share(label: str) -> float:
-    """Return how much of the densest place of a cluster DBSCAN asks of a core, by a method of studies."""
-    return with_settings(load_config("paper"), METHODS[label]).aggregate.min_samples_share
 
 
 def paired(ours: Scores, theirs: Scores) -> dict[str, float]:

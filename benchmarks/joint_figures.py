@@ -37,11 +37,10 @@ def draw_fleet_sizes(bars: dict[str, Any], path: Path) -> None:
     """Draw GOSPA_M and F1 over the number of passes, a row a drive."""
     names = [name for name in bars if name.startswith("paper-ideal, kalman")]
     n = min(row["joint"]["n"] for name in names for row in bars[name].values() if "joint" in row)
-    n_dbscan = min(row["dbscan"]["n"] for name in names for row in bars[name].values() if "dbscan" in row)
-    n_rival = max(row[key]["n"] for name in names for row in bars[name].values() for key in row if "paired" in key)
+    n_dbscan = [row["paired"]["n"] for name in names for row in bars[name].values()]
     caption = (
-        f"{SIMULATED}; {n} replicates or more. Of DBSCAN the first {n_dbscan}, of its\n"
-        f"median with biases taken out the first {n_rival}: these are of other draws."
+        f"{SIMULATED}; {n} replicates or more.\n"
+        f"Of DBSCAN the first {min(n_dbscan)} to {max(n_dbscan)}: these are of other draws."
     )
     with figure_file(path, caption=caption, size=(9.0, 3.2 * len(names))) as figure:
         axes = figure.subplots(len(names), 2, squeeze=False)
@@ -51,8 +50,6 @@ def draw_fleet_sizes(bars: dict[str, Any], path: Path) -> None:
                 style = {"color": colour, "marker": mark, "linestyle": dash, "markersize": 4, "label": label}
                 of = [bars[name][str(v)][method] for v in sizes]
                 medians = {v: row["gospa_m_median"] for v, row in zip(sizes, of, strict=True)}
-                if method == "dbscan corrected":  # where the draws are many: its medians are set beside those of all
-                    medians = {v: row["rival"] for v in sizes for row in _largest(bars[name][str(v)], n_rival)}
                 left.plot(list(medians), [min(median, MOST_M) for median in medians.values()], **style)
                 right.plot(sizes, [row["f1_mean"] for row in of], **style)
             for axis in (left, right):
@@ -65,11 +62,6 @@ def draw_fleet_sizes(bars: dict[str, Any], path: Path) -> None:
             _plain_ticks(left, (0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
             right.set(ylabel="mean F1", ylim=(0, 1.03))
         axes[0, 1].legend(fontsize=7, loc="lower right")
-
-
-def _largest(row: dict[str, Any], n: int) -> list[dict[str, float]]:
-    """Return the comparison with corrected DBSCAN on so many runs, if there is one."""
-    return [row[key] for key in row if "paired" in key and row[key]["n"] == n][:1]
 
 
 def _plain_ticks(axes: Axes, ticks: tuple[float, ...]) -> None:

@@ -27,8 +27,7 @@ against the signs that at least one pass of the fleet reported: what nobody repo
 prior map, signs that it holds count too. Gate 2 m, equal class. *Known association* is the same solver told which
 track is of which sign; it pays for nothing else, so what separates it from the truth is noise and the GNSS offset that
 a fleet has in common. *DBSCAN* is the paper's (`dbscan-first` of a study); *DBSCAN corrected* is DBSCAN after
-`--correct-bias`, on the same detections and passes. Where a core share is told it is its `min_samples_share`: 0 is
-the paper's core rule, measured before there was another; the command's own table below has the default.
+`--correct-bias` with the core rule that `geofleet aggregate` has, on the same detections and passes.
 
 The number of replicates stands beside every figure; few of them settle no 1st percentile. A prior map holds the signs
 that at least half of the passes of the largest fleet report, less what is outdated.
@@ -50,7 +49,7 @@ Mean F1 / mean GOSPA_M (median), m; a fleet without any match has no GOSPA_M and
 FRESH = """### Seeds that nobody looked at
 
 The second drive's runs of the seed above were looked at while the use of a stale prior was mended; these were not.
-Mean F1 / median GOSPA_M (m).
+Corrected DBSCAN has the paper's core rule in this table. Mean F1 / median GOSPA_M (m).
 """
 COMMON = """### What the common offset costs
 
@@ -71,7 +70,7 @@ NAMED = """Faulty passes that the command names, and sound ones. Of what `paper-
 than 3.4 standard deviations, and of offsets drawn with 10 m a good part is small: these cannot be told. A pass that
 no other meets is named too, and not counted here.
 """
-OTHER_DRAWS = """Of DBSCAN the first 20 runs, so that its medians are of other draws; the same runs are compared
+OTHER_DRAWS = """Of DBSCAN the first 20 to 60 runs, so that its medians are of other draws; the same runs are compared
 below."""
 
 
@@ -125,11 +124,6 @@ def _bars(bars: dict[str, Any]) -> str:
     return "\n".join(parts)
 
 
-def _pairs(of: dict[str, Any]) -> list[dict[str, float]]:
-    """Return what joint fusion and its rival have on the same runs, one a core rule of the rival."""
-    return [of[key] for key in sorted(of) if key.startswith("paired at")]
-
-
 def _paired(bars: dict[str, Any]) -> str:
     """Return joint beside corrected DBSCAN on the same runs, where there are many."""
     rows = [
@@ -141,14 +135,12 @@ def _paired(bars: dict[str, Any]) -> str:
             f"{pair['rival']:.3f}",
             f"{pair['low']:+.3f} to {pair['high']:+.3f}",
             f"{100 * pair['won']:.0f} %",
-            f"{pair['core_share']:g}",
         ]
         for name, by_size in bars.items()
         for v in sorted(by_size, key=int)
-        for pair in _pairs(by_size[v])
+        for pair in (by_size[v]["paired"],)
     ]
     head = ("fleet", "passes", "runs", "joint", "DBSCAN corrected", "difference, 95 %", "runs in which joint is nearer")
-    head += ("core share",)
     return _table(head, rows) if rows else ""
 
 
@@ -273,8 +265,7 @@ def _robustness(hard: dict[str, Any]) -> str:
             v,
             _score(of.get("dbscan corrected", of.get("dbscan by default", of.get("dbscan")))),
             _score(of["joint"]),
-            f"{_pairs(of)[-1]['low']:+.3f} to {_pairs(of)[-1]['high']:+.3f}",
-            f"{_pairs(of)[-1]['core_share']:g}",
+            f"{of['paired']['low']:+.3f} to {of['paired']['high']:+.3f}",
             _score(of["known"]),
             f"{100 * of['coverage_90']:.0f} %",
             str(of["joint"]["n"]),
@@ -289,7 +280,6 @@ def _robustness(hard: dict[str, Any]) -> str:
             "DBSCAN corrected",
             "**joint**",
             "difference of medians, 95 %",
-            "core share",
             "known association",
             "in 90 % ellipse",
             "runs",
