@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geofleet.errors import ConfigError
-from geofleet.formats.positions import to_lonlat
+from geofleet.formats.positions import to_lonlat, utm_around
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
 
-_MAX_UTM_LAT_DEG, _MAX_LON_DEG = 84.0, 180.0
 LEAST_RADIUS_M = 6_300_000.0  # the poles lie 6 357 km from the centre
 
 
@@ -42,17 +41,7 @@ def local_crs(crs: str | None, origin: tuple[float, float] | None, utm: tuple[st
         return LocalCrs(utm[0], float(utm[1]), float(utm[2]))
     if origin is None:
         return LocalCrs(crs or "OGC:CRS84")
-    from pyproj import Transformer  # noqa: PLC0415  (only local coordinates need it)
-
-    lat, lon = origin
-    if not (abs(lat) <= _MAX_UTM_LAT_DEG and abs(lon) <= _MAX_LON_DEG):
-        raise ConfigError(
-            f"the origin {lat:g},{lon:g} lies outside of UTM.", todo="Give LAT,LON in degrees, latitude first."
-        )
-    zone = min(int((lon + 180.0) // 6.0) + 1, 60)
-    name = f"EPSG:{(32600 if lat >= 0 else 32700) + zone}"
-    easting, northing = Transformer.from_crs("OGC:CRS84", name, always_xy=True).transform(lon, lat)
-    return LocalCrs(name, float(easting), float(northing))
+    return LocalCrs(*utm_around(*origin))
 
 
 def to_places(x: Floats, y: Floats, z: Floats, local: LocalCrs, *, where: str) -> tuple[Floats, Floats, Floats]:

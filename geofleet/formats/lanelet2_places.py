@@ -14,6 +14,7 @@ import numpy as np
 
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats.mgrs import square_of
+from geofleet.formats.positions import utm_around
 from geofleet.formats.reading import WGS84, Datum
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-_MAX_LON_DEG, _MAX_UTM_LAT_DEG = 180.0, 84.0
 _NAMED_SQUARES = 4
 
 
@@ -49,22 +49,8 @@ class Projection:
         if origin is not None and utm is not None:
             raise ConfigError("origin and utm say the same thing in two ways.", todo="Give one of them.")
         if origin is not None:
-            return cls._around(*origin)
+            return cls(*utm_around(*origin))
         return None if utm is None else cls._named(*utm)
-
-    @classmethod
-    def _around(cls, lat: float, lon: float) -> Projection:
-        """Return the UTM zone of a place, counted from there."""
-        from pyproj import Transformer  # noqa: PLC0415  (only maps in local coordinates need PROJ)
-
-        if not (abs(lat) <= _MAX_UTM_LAT_DEG and abs(lon) <= _MAX_LON_DEG):
-            raise ConfigError(
-                f"the origin {lat:g},{lon:g} lies outside of UTM.", todo="Give LAT,LON in degrees, latitude first."
-            )
-        zone = min(int((lon + 180.0) // 6.0) + 1, 60)
-        crs = f"EPSG:{(32600 if lat >= 0 else 32700) + zone}"
-        easting, northing = Transformer.from_crs("OGC:CRS84", crs, always_xy=True).transform(lon, lat)
-        return cls(crs, float(easting), float(northing))
 
     @classmethod
     def _named(cls, crs: str, easting_m: float, northing_m: float) -> Projection:

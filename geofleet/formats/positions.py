@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from geofleet.errors import SUSPICIOUS, InputError
+from geofleet.errors import SUSPICIOUS, ConfigError, InputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
 
-_MAX_LON_DEG, _MAX_LAT_DEG = 180.0, 90.0
+_MAX_LON_DEG, _MAX_LAT_DEG, _MAX_UTM_LAT_DEG = 180.0, 90.0, 84.0
 _NULL_ISLAND_DEG, _EMPTY_SEA_DEG = 0.001, 1.5  # no land within 1.5 degrees of 0 N 0 E but for one buoy
 _ALONE_M = 100_000.0
 _SWAPPED = (
@@ -223,6 +223,26 @@ def _refuse_contradiction(x: Floats, y: Floats, degrees: Flags, crs: Any, where:
             where=where,
             todo=_SWAPPED if swapped else "Give the CRS, e.g. --crs EPSG:31370.",
         )
+
+
+def utm_around(lat: float, lon: float) -> tuple[str, float, float]:
+    """Return the UTM zone of an origin in degrees, and its easting and northing in metres there.
+
+    Raises
+    ------
+    ConfigError
+        The origin lies outside of UTM.
+    """
+    from pyproj import Transformer  # noqa: PLC0415  (only local coordinates need PROJ)
+
+    if not (abs(lat) <= _MAX_UTM_LAT_DEG and abs(lon) <= _MAX_LON_DEG):
+        raise ConfigError(
+            f"the origin {lat:g},{lon:g} lies outside of UTM.", todo="Give LAT,LON in degrees, latitude first."
+        )
+    zone = min(int((lon + 180.0) // 6.0) + 1, 60)
+    crs = f"EPSG:{(32600 if lat >= 0 else 32700) + zone}"
+    easting_m, northing_m = Transformer.from_crs("OGC:CRS84", crs, always_xy=True).transform(lon, lat)
+    return crs, float(easting_m), float(northing_m)
 
 
 def _alone(lon: Floats, lat: Floats) -> Flags:
