@@ -22,9 +22,10 @@ METHODS = ("dbscan-first", "dbscan-corrected", "joint")
 HEAD = """# Joint fusion, measured
 
 **All fleets below are simulated** (`benchmarks/joint.py`; this page is written by `benchmarks/joint_report.py` from
-`benchmarks/results/joint.json`). Drive A is the demo's, drive B was not used to develop anything. A map is scored
-against the signs that at least one pass of the fleet reported: what nobody reported is beyond every method. With a
-prior map, signs that it holds count too. Gate 2 m, equal class. *Known association* is the same solver told which
+`benchmarks/results/joint.json`). Drive A is the demo's; drive B was used to develop nothing but how a stale
+prior is read (below: seeds that nobody looked at). A map is scored against the signs that at least one pass of the
+fleet reported: what nobody reported is beyond every method. With a prior map, signs
+that it holds count too. Gate 2 m, equal class. *Known association* is the same solver told which
 track is of which sign; it pays for nothing else, so what separates it from the truth is noise and the GNSS offset that
 a fleet has in common. *DBSCAN* is the paper's (`dbscan-first` of a study); *DBSCAN corrected* is DBSCAN after
 `--correct-bias` with the core rule that `geofleet aggregate` has, on the same detections and passes.
