@@ -101,7 +101,6 @@ def test_what_is_there_is_not_done_again(inputs, tmp_path, monkeypatch):
     monkeypatch.undo()
     lost = min((tmp_path / "units").glob("*.json"))
     lost.unlink()
-    (tmp_path / "units" / ".left-over").mkdir()
     assert run_study(study, tmp_path) == rows
     assert lost.is_file()
     assert not list((tmp_path / "units").glob(".*"))
@@ -142,6 +141,18 @@ def test_a_study_goes_on_where_it_was_killed(inputs, tmp_path):
     after = {path: path.stat().st_mtime_ns for path in out.glob("units/*.json")}
     assert len(after) == 12
     assert before.items() <= after.items(), "what was there was not written again"
+
+
+def test_what_another_study_has_begun_in_the_same_folder_stays_for_a_day(tmp_path):
+    begun, old, draft = (tmp_path / name for name in (".of_now", ".of_yesterday", ".of_yesterday.json.tmp"))
+    for folder in (begun, old):
+        folder.mkdir()
+        (folder / "fleet-0.parquet").touch()
+    draft.touch()
+    for path in (old, draft):
+        os.utime(path, (time.time() - 90_000,) * 2)
+    units.remove_leftovers(tmp_path)
+    assert [path.name for path in tmp_path.rglob("*")] == [".of_now", "fleet-0.parquet"]
 
 
 def test_comparison_tables_and_figures(inputs, tmp_path):

@@ -10,7 +10,9 @@ import hashlib
 import json
 import math
 import shutil
+import time
 from concurrent.futures import ProcessPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
     Rows = list[dict[str, Any]]
 
 _LOOK_S = 0.5
+_LEFTOVER_S = 24 * 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +99,7 @@ def run_study(study: Study, folder: Path, *, n_workers: int = 1, progress: Progr
     """
     units_dir = folder / "units"
     units_dir.mkdir(parents=True, exist_ok=True)
-    for leftover in units_dir.glob(".*"):  # of a study that was killed
-        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+    remove_leftovers(units_dir)
     worlds = [_world(study, world, units_dir) for world in study.worlds]
     every = [unit for world in worlds for unit in world.units]
     tell = progress or (lambda _done, _total: None)
@@ -107,6 +109,14 @@ def run_study(study: Study, folder: Path, *, n_workers: int = 1, progress: Progr
         tell(sum(unit.path.is_file() for unit in every), len(every))
     tell(len(every), len(every))
     return [row for world in worlds for unit in world.units for row in read_unit(world, unit)]
+
+
+def remove_leftovers(units_dir: Path) -> None:
+    """Remove what studies that were killed had begun. Younger than a day, it may be of one that still runs."""
+    for leftover in units_dir.glob(".*"):
+        with suppress(FileNotFoundError):  # the other study has just finished it
+            if time.time() - leftover.stat().st_mtime > _LEFTOVER_S:
+                shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
 
 
 def run_all(function: Callable[[Any], Any], tasks: Sequence[Any], *, n_workers: int) -> Iterator[None]:
