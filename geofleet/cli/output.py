@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from geofleet.steps.evaluate import EvaluateResult
 
 _SECONDS_A_LINE = 15
+_FAR = " (over 100 m: --clip leaves them out)"
+_HINTS = {"map_signs_far_from_reference": _FAR, "reference_signs_far_from_map": _FAR}
 
 
 @contextmanager
@@ -140,7 +142,7 @@ def print_evaluation(result: EvaluateResult) -> None:
     _print_comparisons(result.comparisons)
     for name, number in result.counts.items():
         if number:
-            typer.echo(f"{name}: {number}")
+            typer.echo(f"{name}: {number}{_HINTS.get(name, '')}")
     print_files(result.files)
 
 
@@ -154,7 +156,8 @@ def _print_intervals(rows: tuple[dict[str, Any], ...]) -> None:
             )
         elif row["score"] in ("f1", "gospa_m"):
             typer.echo(f"{row['score']}: no interval: {row['note']}")
-    for note in sorted({row["note"] for row in rows if row["note"] and row["low"] is not None}):
+    notes = (note for row in rows if row["note"] and row["low"] is not None for note in row["note"].split("; "))
+    for note in dict.fromkeys(notes):
         typer.echo(f"  beware: {note}")
 
 

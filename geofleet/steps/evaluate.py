@@ -81,7 +81,8 @@ class EvaluateResult:
     comparisons
         Of the map with another one: difference of every score, interval, p-value and verdict.
     counts
-        Signs left out by `--clip` and `--in-view`, and signs without an error ellipse.
+        Signs left out by `--clip` and `--in-view`, signs that `--clip` would leave out, and signs without an error
+        ellipse.
     """
 
     out: Path
@@ -175,6 +176,7 @@ def evaluate(
     counts = {
         "map_signs_clipped": map_.num_rows - layers["fused"].num_rows,
         "reference_signs_clipped": reference.num_rows - layers["reference"].num_rows,
+        **_far(map_, reference, clip_m),
         "reference_signs_never_in_view": whole.num_rows - reference.num_rows,
         "map_signs_without_ellipse": n_without,
     }
@@ -188,6 +190,17 @@ def evaluate(
     )
     rows = {name: tuple(part) for name, part in more.items()}
     return EvaluateResult(out=out, totals=_totals(scores), files=files, counts=counts, **rows)
+
+
+def _far(map_: pa.Table, reference: pa.Table, clip_m: float | None) -> dict[str, int]:
+    """Count the signs that `--clip` would leave out: many are a map and a reference of different places."""
+    if clip_m is not None:
+        return {}
+    near, ref_near = _used_rows(list(_pairs(map_, reference, clip_m=CLIP_M)), map_.num_rows, reference.num_rows)
+    return {
+        "map_signs_far_from_reference": near.false_count,
+        "reference_signs_far_from_map": ref_near.false_count,
+    }
 
 
 def _compare(

@@ -221,6 +221,20 @@ def test_clip_of_maps_far_apart_leaves_nothing_and_says_so(tmp_path, make_signs)
     assert result.counts["map_signs_clipped"] == 1
 
 
+def test_signs_far_from_the_other_map_are_counted_where_nothing_is_clipped(tmp_path, make_signs):
+    map_, reference = (
+        make_signs([(0, 0), (500, 0)], ["stop"] * 2),
+        make_signs([(1, 0), (0, 101), (0, 900)], ["stop"] * 3),
+    )
+    counts = evaluate_with(tmp_path, map_, reference).counts
+    assert counts["map_signs_far_from_reference"] == 1
+    assert counts["reference_signs_far_from_map"] == 2
+    (tmp_path / "empty").mkdir()
+    counts = evaluate_with(tmp_path / "empty", map_.slice(0, 0), reference).counts
+    assert counts["map_signs_far_from_reference"] == 0
+    assert counts["reference_signs_far_from_map"] == 3
+
+
 def test_in_view_leaves_out_what_no_pass_saw(tmp_path, make_signs):
     signs = make_signs([(0, 0), (100, 0)], ["stop"] * 2)
     columns = {name: signs[name] for name in signs.column_names if name not in ("geometry", "bbox")}
