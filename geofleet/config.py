@@ -173,6 +173,7 @@ class EvaluateConfig(_Section):
 
     gate_m: Positive
     match_on: Literal["class", "concept", "none"]
+    correlation_m: Annotated[float, Field(gt=0, allow_inf_nan=False), Off(100.0)]
 
 
 class SensorKind(_Section):

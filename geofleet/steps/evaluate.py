@@ -169,7 +169,7 @@ def evaluate(
         "confusion": _confusion(pairs, gate_m=gate_m),
         "sources": _score_sources(pairs, gate_m=gate_m, match_on=match_on),
         "summary": summarise_scores(_totals(scores)),
-        "intervals": interval_rows(matches, _totals(scores), gate_m=gate_m, drive=drive),
+        "intervals": interval_rows(matches, _totals(scores), drive=drive, **_along(config)),
         "comparisons": _compare(matches, scores, versus_path, reference, drive, clip_m=clip_m, config=config),
     }
     files, n_without = _write(out, layers, more)
@@ -190,6 +190,10 @@ def evaluate(
     )
     rows = {name: tuple(part) for name, part in more.items()}
     return EvaluateResult(out=out, totals=_totals(scores), files=files, counts=counts, **rows)
+
+
+def _along(config: Config) -> dict[str, float]:
+    return config.evaluate.model_dump(include={"gate_m", "correlation_m"})
 
 
 def _far(map_: pa.Table, reference: pa.Table, clip_m: float | None) -> dict[str, int]:
@@ -221,7 +225,7 @@ def _compare(
     other_matches = _match_pairs(list(_pairs(other, reference, clip_m=clip_m)), config)
     other_scores = score_matches(other_matches, gate_m=gate_m, match_on=match_on)
     totals = (_totals(scores), _totals(other_scores))
-    return comparison_rows((matches, other_matches), totals, gate_m=gate_m, drive=drive)
+    return comparison_rows((matches, other_matches), totals, drive=drive, **_along(config))
 
 
 def score_layers(map_: pa.Table, reference: pa.Table, *, config: EvaluateConfig) -> MapScore:

@@ -29,7 +29,7 @@ _SHORTEST_ROAD_M = 1.0  # signs at one point stand along no road: too few blocks
 
 
 def interval_rows(
-    matches: pa.Table, totals: Totals, *, gate_m: float, drive: Drive | None = None
+    matches: pa.Table, totals: Totals, *, gate_m: float, correlation_m: float = 100.0, drive: Drive | None = None
 ) -> list[dict[str, Any]]:
     """Return the interval of every score of every method and fleet size.
 
@@ -42,6 +42,8 @@ def interval_rows(
         Of an evaluation.
     gate_m
         c, metres.
+    correlation_m
+        Along the road, of one map (`uncertainty_road.road_intervals`).
     drive
         Stations are taken along it; along a space-filling curve when it is None.
     """
@@ -55,15 +57,21 @@ def interval_rows(
             }
         else:
             (outcomes,) = _along_road([_matches_of(matches, runs[0])], drive)
-            found = (
-                {(name, "road"): i for name, i in road_intervals(outcomes, gate_m=gate_m).items()} if outcomes else {}
+            intervals = (
+                road_intervals(outcomes, gate_m=gate_m, correlation_m=correlation_m) if outcomes is not None else {}
             )
+            found = {(name, "road"): interval for name, interval in intervals.items()}
         rows += [_row(labels, name, interval) for (name, _), interval in found.items()]
     return rows
 
 
 def comparison_rows(
-    matches: tuple[pa.Table, pa.Table], totals: tuple[Totals, Totals], *, gate_m: float, drive: Drive | None = None
+    matches: tuple[pa.Table, pa.Table],
+    totals: tuple[Totals, Totals],
+    *,
+    gate_m: float,
+    correlation_m: float = 100.0,
+    drive: Drive | None = None,
 ) -> list[dict[str, Any]]:
     """Test for every score whether map A (first) is better than map B (second) against the same reference.
 
@@ -83,7 +91,8 @@ def comparison_rows(
         a, b = outcomes
         if a is None or b is None:
             return []
-        found = {name: compare_on_road(a, b, score=name, gate_m=gate_m) for name in ROAD_SCORES}
+        options = {"gate_m": gate_m, "correlation_m": correlation_m}
+        found = {name: compare_on_road(a, b, score=name, **options) for name in ROAD_SCORES}
     elif runs[0] == runs[1]:
         found = {
             name: compare_replicates(*([row[name] for row in rows] for rows in totals), score=name)

@@ -221,6 +221,19 @@ def test_clip_of_maps_far_apart_leaves_nothing_and_says_so(tmp_path, make_signs)
     assert result.counts["map_signs_clipped"] == 1
 
 
+def test_the_correlation_length_is_a_setting_of_intervals_along_the_road(tmp_path, make_signs):
+    reference = make_signs([(25.0 * i, 0) for i in range(200)], ["stop"] * 200)
+    map_ = make_signs([(25.0 * i + (i // 20) * 0.15, 0) for i in range(200) if i // 7 % 2], ["stop"] * 98)
+    lengths = {}
+    for correlation_m in (100.0, 300.0):
+        (tmp_path / str(correlation_m)).mkdir()
+        found = evaluate_with(tmp_path / str(correlation_m), map_, reference, f"correlation_m={correlation_m}")
+        by_score = {row["score"]: row for row in found.intervals}
+        assert by_score["f1"]["low"] < by_score["f1"]["estimate"] < by_score["f1"]["high"]
+        lengths[correlation_m] = by_score["gospa_m"]["high"] - by_score["gospa_m"]["low"]
+    assert lengths[100.0] != lengths[300.0]
+
+
 def test_signs_far_from_the_other_map_are_counted_where_nothing_is_clipped(tmp_path, make_signs):
     map_, reference = (
         make_signs([(0, 0), (500, 0)], ["stop"] * 2),
