@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 from geofleet.errors import ConfigError
 from geofleet.formats.drive_times import guess_format, times_of
 from geofleet.formats.inventory_columns import numbers, read_options
+from geofleet.tables.arrays import sound_times
 from geofleet.tables.schemas import TIME
 
 if TYPE_CHECKING:
@@ -200,7 +201,8 @@ def time_column(table: pa.Table, name: str | None) -> tuple[pa.Array, int]:
         return pa.nulls(table.num_rows, TIME), 0
     column = table[name].combine_chunks()
     if pa.types.is_timestamp(column.type):
-        return column.cast(pa.timestamp("us", column.type.tz), safe=False).cast(TIME), 0
+        times = sound_times(column)
+        return times.cast(TIME), times.null_count - column.null_count
     text = pd.Series(text_column(table, name).to_numpy(zero_copy_only=False), dtype="string")
     known = text.notna()
     if not known.any():

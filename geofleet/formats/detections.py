@@ -219,8 +219,9 @@ def _coordinates(batch: Batch, plan: _Plan) -> tuple[Floats, Floats]:
         first = next(iter(column.drop_null().slice(0, 1).to_pylist()), "")
         text = column.to_numpy(zero_copy_only=False)
         shapes = np.asarray(geometry_reader(first)(text, on_invalid="ignore"), object)
-    point = shapely.get_type_id(shapes) == _POINT
-    return np.where(point, shapely.get_x(shapes), np.nan), np.where(point, shapely.get_y(shapes), np.nan)
+    is_place = (shapely.get_type_id(shapes) == _POINT) & ~shapely.is_empty(shapes)
+    points = np.where(is_place, shapes, None)
+    return shapely.get_x(points), shapely.get_y(points)
 
 
 def _places(batch: Batch, plan: _Plan, path: Path) -> tuple[Floats, Floats]:

@@ -206,8 +206,8 @@ def _split_drives(
 ) -> dict[str, Epochs]:
     if not column:
         return {"": epochs.take(placed)}
-    names = frame[column].fillna("").astype(str).str.strip().to_numpy(object)
-    return {name: epochs.take(placed & (names == name)) for name in dict.fromkeys(names[placed].tolist())}
+    number, names = pd.factorize(frame[column].fillna("").str.strip())  # numpy takes "a\0" for "a" where it compares
+    return {names[n]: epochs.take(placed & (number == n)) for n in dict.fromkeys(number[placed].tolist())}
 
 
 def _numbers(frame: pd.DataFrame, column: str | None) -> Floats:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from geofleet.tables.arrays import FIRST_TIME, LAST_TIME
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -58,11 +60,18 @@ class Epochs:
 
     @classmethod
     def of(cls, lon: Floats, lat: Floats, **given: Any) -> Epochs:
-        """Return epochs of which nothing is known but the position and what is given."""
+        """Return epochs of which nothing is known but the position and what is given.
+
+        A year like -1 or 40000, as a damaged line may have it, is no time.
+        """
         n = len(lon)
         unknown = {name: np.full(n, np.nan) for name in ("height_m", "sigma_e_m", "sigma_n_m", "n_satellites")}
         empty = {"t_utc": np.full(n, "NaT", "datetime64[us]"), "quality": np.full(n, None, object)}
-        return cls(lon=lon, lat=lat, **(unknown | empty | given))
+        values = unknown | empty | given
+        sound = (values["t_utc"] >= FIRST_TIME) & (values["t_utc"] < LAST_TIME)
+        return cls(
+            lon=lon, lat=lat, **(values | {"t_utc": np.where(sound, values["t_utc"], np.datetime64("NaT", "us"))})
+        )
 
     def take(self, rows: NDArray[np.bool_] | Ints) -> Epochs:
         """Return some of the epochs."""

@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats.osm_tags import COMPASS_DEG
+from geofleet.tables.arrays import sound_times
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -285,7 +286,7 @@ def parse_times(
         Whether `1/2/2022` is in February. By default what the other dates of the column show: those that can be read
         in one way only, when at least 95 % of these agree; else such a date is left out and counted.
     """
-    values = column.to_pylist()
+    values = _values(column)
     unique = {value for value in values if value is not None}
     dated = {value: _DATE.fullmatch(value.strip()) for value in unique if isinstance(value, str)}
     order = _order(values, dated) if day_first is None else day_first
@@ -293,6 +294,15 @@ def parse_times(
     times = [None if value is None else read[value] for value in values]
     bad = sum(value is not None and read[value] is None and value != "" for value in values)
     return times, {"dates that cannot be read or could be day or month first": bad} if bad else {}
+
+
+def _values(column: pa.ChunkedArray) -> list[Any]:
+    """Return a column as Python's values; a timestamp that is no time of a clock as a text that is none either."""
+    if not pa.types.is_timestamp(column.type) and not pa.types.is_date(column.type):
+        return list(column.to_pylist())
+    sound = sound_times(column)
+    lost = pc.and_(pc.is_valid(column), pc.is_null(sound)).to_pylist()
+    return ["no time" if is_lost else value for value, is_lost in zip(sound.to_pylist(), lost, strict=True)]
 
 
 def _facing(text: str) -> float:

@@ -74,7 +74,9 @@ def own_layer(path: Path, features: Features, crs: Any = None) -> LayerRead:
         A geometry is no point or has no valid position: no export of ours has such.
     """
     geometry = features.geometry
-    is_point = np.zeros(features.table.num_rows, bool) if geometry is None else shapely.get_type_id(geometry) == 0
+    is_point = np.zeros(features.table.num_rows, bool)
+    if geometry is not None:
+        is_point = (shapely.get_type_id(geometry) == 0) & ~shapely.is_empty(geometry)
     if geometry is None or not is_point.all():
         raise InputError(
             f"a layer of signs, but {int((~is_point).sum())} of {len(is_point)} rows are no points.",

@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
+
+FIRST_TIME, LAST_TIME = np.datetime64("1900-01-01", "us"), np.datetime64("2200-01-01", "us")
 
 
 def arrow_texts(values: Sequence[str | None]) -> pa.Array:
@@ -36,6 +39,14 @@ def arrow_numbers(values: NDArray[Any]) -> pa.Array:
 def arrow_times(microseconds: NDArray[np.int64], missing: int) -> pa.Array:
     """Return times since 1970 as an Arrow array in UTC over the same memory; the number `missing` is null."""
     return _over(np.ascontiguousarray(microseconds), pa.timestamp("us", tz="UTC"), microseconds == missing)
+
+
+def sound_times(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return timestamps or dates in microseconds; those that no clock of a car shows, such as of the year 33658, are null."""
+    times = column.cast(pa.timestamp("us", getattr(column.type, "tz", None)), safe=False)
+    count = times.cast(pa.int64())
+    is_sound = pc.and_(pc.greater_equal(count, FIRST_TIME.astype(int)), pc.less(count, LAST_TIME.astype(int)))
+    return pc.if_else(is_sound, times, pa.scalar(None, times.type))
 
 
 def _over(values: NDArray[Any], kind: pa.DataType, missing: NDArray[np.bool_]) -> pa.Array:

@@ -11,6 +11,7 @@ import pyarrow.compute as pc
 
 from geofleet.errors import SUSPICIOUS, GeofleetError
 from geofleet.formats.layers import FORMATS, read_layer
+from geofleet.tables.arrays import sound_times
 from geofleet.tables.schemas import BBOX, DRIVES, LANES, SIGNS
 from geofleet.taxonomy.reader import RAW_PREFIX
 from geofleet.workflows.anyfile import read_any
@@ -190,9 +191,8 @@ def _extent(rows: pa.Table) -> tuple[float, float, float, float] | None:
 
 def _times(rows: pa.Table) -> tuple[str | None, str | None]:
     """Return the first and the last time in any column."""
-    columns = [
-        rows[f.name] for f in rows.schema if pa.types.is_timestamp(f.type) and rows[f.name].null_count < len(rows)
-    ]
+    every = [sound_times(rows[f.name]) for f in rows.schema if pa.types.is_timestamp(f.type)]
+    columns = [column for column in every if column.null_count < len(rows)]
     if not columns:
         return None, None
     first, last = min(pc.min(one).as_py() for one in columns), max(pc.max(one).as_py() for one in columns)

@@ -9,6 +9,8 @@ import random
 import re
 
 import geopandas
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from geofleet.errors import GeofleetError
@@ -16,6 +18,7 @@ from geofleet.steps.ingest import ingest_drive, ingest_lanes, ingest_signs
 from geofleet.steps.ingest_detections import ingest_detections
 from geofleet.tables.schemas import DETECTIONS, DRIVES, LANES, SIGNS
 from geofleet.tables.store import read_table
+from geofleet.workflows.info import info
 
 STEPS = {
     "signs": (ingest_signs, SIGNS),
@@ -180,3 +183,33 @@ def test_damaged_binaries_give_a_table_or_one_message(tmp_path, name, binaries):
     for n in range(ROUNDS):
         path.write_bytes(damaged(binaries[name], draw, is_text=False))
         survives(kind, path, tmp_path / str(n) / "out.parquet")
+
+
+def test_a_car_whose_name_is_a_null_character_keeps_its_epochs(tmp_path):
+    path = tmp_path / "drive.csv"
+    path.write_text(DRIVE_CSV.replace("v0,", "\0,", 1))
+    assert survives("drive", path, tmp_path / "out" / "out.parquet")
+
+
+def test_an_empty_point_is_a_detection_without_a_position(tmp_path):
+    features = [GEOJSON["features"][0] | {"geometry": {"type": "Point", "coordinates": []}}, *GEOJSON["features"][1:]]
+    path = tmp_path / "fleet.geojson"
+    path.write_text(json.dumps(GEOJSON | {"features": features}))
+    result = ingest_detections([path], tmp_path / "out.parquet")
+    assert (result.n_rows, result.skipped) == (3, {"position missing or no number": 1})
+
+
+def test_years_of_no_clock_are_no_times(tmp_path):
+    path = tmp_path / "drive.pos"
+    path.write_text(POS.replace("2024/05/01 12:00:05", "-1/05/01 12:00:05"))
+    result = info(path)
+    assert result.skipped["epochs without a time"] == 1
+    assert result.t_first.startswith("2024-05-01")
+    times = pa.array([10**18, None, 10**15], pa.timestamp("us", "UTC"))
+    for column, said in (("t_first", "t_first that cannot be read, left out"), ("first_seen", "dates that cannot be")):
+        table = {"lon": [13.4] * 3, "lat": [52.5] * 3, column: times, "code": ["206"] * 3}
+        table |= {"pass_id": ["a"] * 3} if column == "t_first" else {}
+        pq.write_table(pa.table(table), tmp_path / "far.parquet")
+        far = info(tmp_path / "far.parquet")
+        assert far.t_first.startswith("2001-09-09")
+        assert [n for name, n in far.found.items() if name.startswith(said)] == [1]
