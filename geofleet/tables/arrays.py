@@ -42,7 +42,7 @@ def arrow_times(microseconds: NDArray[np.int64], missing: int) -> pa.Array:
 
 
 def sound_times(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return timestamps or dates in microseconds; those that no clock of a car shows, such as of the year 33658, are null."""
+    """Return timestamps or dates in microseconds; those that no clock shows, as in the year 33658, are null."""
     times = column.cast(pa.timestamp("us", getattr(column.type, "tz", None)), safe=False)
     count = times.cast(pa.int64())
     is_sound = pc.and_(pc.greater_equal(count, FIRST_TIME.astype(int)), pc.less(count, LAST_TIME.astype(int)))
