@@ -220,8 +220,9 @@ def _coordinates(batch: Batch, plan: _Plan) -> tuple[Floats, Floats]:
         text = column.to_numpy(zero_copy_only=False)
         shapes = np.asarray(geometry_reader(first)(text, on_invalid="ignore"), object)
     is_place = (shapely.get_type_id(shapes) == _POINT) & ~shapely.is_empty(shapes)
-    points = np.where(is_place, shapes, None)
-    return shapely.get_x(points), shapely.get_y(points)
+    places = np.full(len(shapes), None, object)
+    places[is_place] = shapes[is_place]
+    return shapely.get_x(places), shapely.get_y(places)
 
 
 def _places(batch: Batch, plan: _Plan, path: Path) -> tuple[Floats, Floats]:
