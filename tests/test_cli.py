@@ -6,6 +6,7 @@ import io
 import json
 import subprocess
 import sys
+import time
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -224,6 +225,25 @@ def test_a_study_that_cannot_be(arguments, says, tables, tmp_path):
     result = geofleet("study", *arguments, *inputs, "--out", "out", cwd=tmp_path)
     assert_refused(result, says, cwd=tmp_path)
     assert "..." not in result.stderr, "work was announced before the fault was found"
+
+
+def test_a_fault_of_an_input_stands_alone(tmp_path):
+    (tmp_path / "signs.geojson").write_text('{"type": "FeatureCollection", "features": [{"type": "Feat')
+    (tmp_path / "drive.csv").write_text("time,lat,lon\nx,y,z\n")
+    for what, name in (("signs", "signs.geojson"), ("drive", "drive.csv"), ("detections", "drive.csv")):
+        result = geofleet("ingest", what, name, "--out", "out.parquet", cwd=tmp_path)
+        assert_refused(result, name, cwd=tmp_path)
+        assert len(result.stderr.splitlines()) == 1, result.stderr
+
+
+def test_work_that_lasts_is_announced_before_anything_is_done(monkeypatch, capsys):
+    monkeypatch.setattr(output, "_PATIENCE_S", 0.05)
+    with output.progress_bar("reading signs") as tell:
+        tell(0, 1)
+        assert not capsys.readouterr().err
+        time.sleep(0.5)
+        tell(1, 1)
+    assert capsys.readouterr().err == "reading signs ...\n"
 
 
 def test_progress_tells_the_time_left_but_not_at_the_end(monkeypatch, capsys):

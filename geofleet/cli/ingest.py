@@ -108,7 +108,9 @@ def ingest_lanes(
 def ingest_drive(
     inputs: Inputs,
     out: Out,
-    file_format: Annotated[str, typer.Option("--format", help="auto, rtklib, nmea, gpx or csv.")] = "auto",
+    file_format: Annotated[
+        str, typer.Option("--format", help="auto, rtklib, nmea, gpx, gnsslogger, gis or csv.")
+    ] = "auto",
     columns: Columns = None,
     crs: Crs = None,
     origin: Origin = None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
@@ -22,16 +23,21 @@ if TYPE_CHECKING:
 _SECONDS_A_LINE = 15
 _FAR = " (over 100 m: --clip leaves them out)"
 _HINTS = {"map_signs_far_from_reference": _FAR, "reference_signs_far_from_map": _FAR}
+_PATIENCE_S = 2.0
 
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     """Draw a progress bar with the time left on a terminal; elsewhere (CI, a pipe) tell it line by line, seldom.
 
-    Nothing is told before the work has begun: what is wrong with the input comes first, and alone.
+    Nothing is told before the work has gone on for a moment: what is wrong with the input comes first, and alone.
     """
     if not sys.stderr.isatty():
-        yield _Lines(label).tell
+        lines = _Lines(label)
+        try:
+            yield lines.tell
+        finally:
+            lines.stop()
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -49,6 +55,9 @@ class _Lines:
         self._label, self._begin = label, time.monotonic()
         self._last = self._begin
         self._first: int | None = None
+        self._announcement = threading.Timer(_PATIENCE_S, self._announce)
+        self._announcement.daemon = True
+        self._is_announced = threading.Lock()
         self._fresh: tuple[float, int] | None = None  # when something was done first, and how much there was then
 
     def tell(self, done: int, total: int) -> None:
@@ -59,7 +68,9 @@ class _Lines:
         now = time.monotonic()
         if self._first is None:
             self._first = done
-            sys.stderr.write(f"{self._label} ...\n")
+            self._announcement.start()
+        if 0 < done < total:
+            self._announce()
         if self._fresh is None and done > self._first:
             self._fresh = now, done
         if now - self._last >= _SECONDS_A_LINE:
@@ -68,6 +79,16 @@ class _Lines:
                 since, before = self._fresh
                 left = f", about {(now - since) / (done - before) * (total - done):.0f} s left"
             sys.stderr.write(f"{self._label}: {done} of {total} after {now - self._begin:.0f} s{left}\n")
+
+    def stop(self) -> None:
+        """Say nothing more."""
+        self._announcement.cancel()
+
+    def _announce(self) -> None:
+        """Say what is being done, once: when something is done, or after a while, which no fault of an input takes."""
+        if self._is_announced.acquire(blocking=False):
+            self._announcement.cancel()
+            sys.stderr.write(f"{self._label} ...\n")
 
 
 def print_result(result: Any, *, as_json: bool) -> None:

@@ -207,9 +207,6 @@ def time_column(table: pa.Table, name: str | None) -> tuple[pa.Array, int]:
     known = text.notna()
     if not known.any():
         return pa.nulls(table.num_rows, TIME), 0
-    form = guess_format(text[known])
-    if form == "relative_s":
-        return pa.nulls(table.num_rows, TIME), int(known.sum())
-    t_utc, _ = times_of(text, form)
+    t_utc, _ = times_of(text, guess_format(text[known]))
     lost = known.to_numpy(bool) & np.isnat(t_utc)
     return pa.array(t_utc, pa.timestamp("us")).cast(TIME), int(lost.sum())

@@ -13,11 +13,21 @@ import numpy as np
 import pandas as pd
 
 from geofleet.errors import InputError
+from geofleet.formats.drive_dates import dated, n_without_zone
+from geofleet.formats.drive_degrees import SCALED, degrees_of
 from geofleet.formats.drive_epochs import NO_EPOCH, NO_POSITION, Epochs
 from geofleet.formats.drive_layout import detect, layout_of
-from geofleet.formats.drive_places import LocalCrs, local_crs, to_places
-from geofleet.formats.drive_times import guess_format, n_without_zone, numbers_of, times_of, times_of_velocity
-from geofleet.formats.gnss_time import gps_week_time, gpst_to_utc
+from geofleet.formats.drive_names import DATE_PARTS
+from geofleet.formats.drive_places import LocalCrs, is_geographic, local_crs, to_places
+from geofleet.formats.drive_times import (
+    RELATIVE_S,
+    guess_format,
+    numbers_of,
+    times_of,
+    times_of_velocity,
+    unit_by_speed,
+)
+from geofleet.formats.gnss_time import gps_week_time, gpst_to_utc, microseconds
 from geofleet.formats.reading import refuse_long_lines
 
 if TYPE_CHECKING:
@@ -34,7 +44,7 @@ __all__ = ["detect", "read_epochs", "stated_crs"]
 
 _QUALITIES = {"fixed", "float", "sbas", "dgps", "single", "ppp", "derived"}
 _DAY_OR_MONTH = ", or could have the day or the month first (say day_first in a TOML file)"
-_CLOCK = r"\d{1,2}:\d{2}(:\d{1,2}([.,]\d*)?)?"
+_MS_OF_WEEK = 604_800.0  # as seconds, none is larger
 
 
 def stated_crs(
@@ -64,10 +74,12 @@ def read_epochs(
     path
         The file.
     columns
-        Thing to column: `time`, or `week` and `tow`, with `date` where `time` is a time of day; `x`, `y` and `height`
-        (or Earth-centred z); `speed`, `quality`, `satellites`, `sigma_e`, `sigma_n`; `drive` for a file of several
-        drives; `time_format`, one of `TIME_FORMATS`. Or a TOML file with a table `columns` and, beside it, `crs`,
-        `origin`, `time_format`, `day_first`, `delimiter` and `encoding`. In numbers a comma may be the decimal point.
+        Thing to column: `time` (with `nanoseconds` beside whole seconds, and `date` where it is a time of day), or
+        `week` and `tow`, or `year` to `second`; `x` and `y` (with `x_side` and `y_side` where the hemisphere is a
+        column of its own), or `lat_lon`; `height` (or Earth-centred z), `speed`, `quality`, `satellites`, `sigma_e`,
+        `sigma_n`; `drive` for a file of several drives; `time_format`, one of `TIME_FORMATS`. Or a TOML file with a
+        table `columns` and, beside it, `crs`, `origin`, `time_format`, `day_first`, `delimiter` and `encoding`. In
+        numbers a comma may be the decimal point.
     crs
         CRS of x and y; OGC:CRS84 by default.
     origin
@@ -91,10 +103,12 @@ def read_epochs(
     refuse_long_lines(path)
     layout, local, notes = _settled(path, columns, crs, origin, utm)
     frame, n_broken = _read(path, layout)
-    x, y, z = (_numbers(frame, layout.columns.get(thing)) for thing in ("x", "y", "height"))
+    x, y, made_of = _coordinates(frame, layout, local)
+    has_heights = not any(what.startswith(SCALED[:20]) for what in made_of)  # they may be in any unit then
+    z = _numbers(frame, layout.columns.get("height") if has_heights else None)
     lon, lat, height_m = to_places(x, y, z, local, where=str(path))
     t_utc, elapsed_s, told = _times(frame, layout, lon, lat)
-    has_clock = not {"time", "tow"}.isdisjoint(layout.columns)
+    has_clock = not {"time", "tow", "year"}.isdisjoint(layout.columns)
     epochs = Epochs.of(
         lon,
         lat,
@@ -115,7 +129,7 @@ def read_epochs(
             todo="Name the columns: --columns time=…,x=…,y=…." if len(frame) else "Export it again.",
         )
     skipped = {NO_EPOCH: n_broken + int((~readable).sum()), NO_POSITION: int((readable & ~placed).sum())}
-    found = dict.fromkeys(notes, int(placed.sum())) | told
+    found = dict.fromkeys([*notes, *made_of], int(placed.sum())) | told
     return _split_drives(epochs, frame, layout.columns.get("drive"), placed), skipped, found
 
 
@@ -165,40 +179,71 @@ def _read(path: Path, layout: Layout) -> tuple[pd.DataFrame, int]:
     return frame, max(n_lines - len(frame), 0)
 
 
+def _coordinates(frame: pd.DataFrame, layout: Layout, local: LocalCrs) -> tuple[Floats, Floats, list[str]]:
+    """Return x and y, and what was made of them, for the user."""
+    if "lat_lon" in layout.columns or is_geographic(local.crs):
+        return degrees_of(frame, layout.columns)
+    return _numbers(frame, layout.columns["x"]), _numbers(frame, layout.columns["y"]), []
+
+
 def _times(
     frame: pd.DataFrame, layout: Layout, lon: Floats, lat: Floats
 ) -> tuple[NDArray[np.datetime64], Floats | None, dict[str, int]]:
     """Return UTC, seconds where the file does not say since when, and what to tell."""
     names = layout.columns
     unknown = np.full(len(frame), "NaT", "datetime64[us]")
-    if "week" in names and "tow" in names and "time" not in names:
-        gpst = gps_week_time(_numbers(frame, names["week"]), _numbers(frame, names["tow"]))
-        return gpst_to_utc(gpst), None, {}
-    if "time" in names:
-        text = _text_of_times(frame, names["time"], names.get("date"))
-        told = {}
-        chosen = layout.time_format
-        if chosen in (None, "velocity"):
-            chosen = guess_format(text)
-            told[f"times read as {chosen} (guessed)"] = len(text)
-        t_utc, elapsed_s = times_of(text, chosen, day_first=layout.day_first)
-        if chosen == "iso":
-            n_bad = int((text.notna() & np.isnat(t_utc)).sum())
-            n_bare = 0 if "utc" in names["time"].lower() else n_without_zone(text[~np.isnat(t_utc)])
-            told |= {"times without a zone, taken as UTC": n_bare, f"times that cannot be read{_DAY_OR_MONTH}": n_bad}
-        return t_utc, elapsed_s, {name: n for name, n in told.items() if n}
+    if "time" in names or set(DATE_PARTS) <= names.keys():
+        return _of_time(frame, layout, lon, lat)
+    if "week" in names and "tow" in names:
+        tow = _numbers(frame, names["tow"])
+        is_ms = bool(np.nanmax(tow, initial=0.0) > _MS_OF_WEEK)
+        gpst = gps_week_time(_numbers(frame, names["week"]), tow / 1000.0 if is_ms else tow)
+        return gpst_to_utc(gpst), None, {"times of week read as milliseconds (guessed)": len(frame)} if is_ms else {}
     if "speed" in names:
         elapsed_s = times_of_velocity(lon, lat, _numbers(frame, names["speed"]))
         return unknown, elapsed_s, {"no times: seconds derived from the speeds": len(frame)}
     return unknown, None, {}
 
 
-def _text_of_times(frame: pd.DataFrame, time: str, date: str | None) -> pd.Series[str]:
-    """Return the column of times; with that of the dates before it where it holds but times of the day."""
-    text = frame[time].str.strip()
-    if date is None or not text.str.fullmatch(_CLOCK).all():
-        return text
-    return frame[date].str.strip() + " " + text
+def _of_time(
+    frame: pd.DataFrame, layout: Layout, lon: Floats, lat: Floats
+) -> tuple[NDArray[np.datetime64], Floats | None, dict[str, int]]:
+    """Return UTC, or seconds, of the column of times, and what to tell."""
+    names, chosen = layout.columns, layout.time_format
+    text, told = _text_of_times(frame, names, day_first=layout.day_first)
+    if chosen in (None, "velocity"):
+        chosen = guess_format(text, names.get("time", ""))
+        t_utc, elapsed_s = times_of(text, chosen, day_first=layout.day_first)
+        if chosen == RELATIVE_S and elapsed_s is not None:
+            chosen = unit_by_speed(elapsed_s, lon, lat)
+        told[f"times read as {chosen} (guessed)"] = len(text)
+    t_utc, elapsed_s = times_of(text, chosen, day_first=layout.day_first)
+    if "nanoseconds" in names:
+        rest_s = _numbers(frame, names["nanoseconds"]) * 1e-9
+        t_utc, elapsed_s = t_utc + microseconds(rest_s), None if elapsed_s is None else elapsed_s + rest_s
+    if chosen == "iso":
+        is_lost = text.notna().to_numpy(bool) & np.isnat(t_utc)
+        is_utc = any("utc" in names.get(thing, "").lower() for thing in ("time", "date"))
+        n_bare = 0 if is_utc else n_without_zone(text[~np.isnat(t_utc)])
+        told |= {"times without a zone, taken as UTC": n_bare}
+        if is_lost.any():
+            told[f"times that cannot be read, such as {text[is_lost].iloc[0][:40]!r}{_DAY_OR_MONTH}"] = int(
+                is_lost.sum()
+            )
+    return t_utc, elapsed_s, {name: n for name, n in told.items() if n}
+
+
+def _text_of_times(
+    frame: pd.DataFrame, names: Mapping[str, str], *, day_first: bool | None
+) -> tuple[pd.Series[str], dict[str, int]]:
+    """Return the times as text, with their dates before them where those stand in other columns; and what to tell."""
+    if "time" not in names:
+        parts = [frame[names[part]].str.strip().str.replace(r"\.0*$", "", regex=True) for part in DATE_PARTS[:-1]]
+        year, month, day, hour, minute = (part.str.zfill(2) for part in parts)
+        second = frame[names["second"]].str.strip().str.replace(r"^(\d)(?=\.|$)", r"0\1", regex=True)
+        return year + "-" + month + "-" + day + "T" + hour + ":" + minute + ":" + second, {}
+    time = frame[names["time"]].str.strip()
+    return dated(frame[names["date"]].str.strip(), time, day_first=day_first) if "date" in names else (time, {})
 
 
 def _split_drives(

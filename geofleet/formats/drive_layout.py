@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from geofleet.errors import ConfigError, InputError
+from geofleet.formats.drive_names import THINGS, guess_columns
 from geofleet.formats.drive_times import TIME_FORMATS
 from geofleet.formats.inventory_columns import read_options
 from geofleet.formats.reading import read_head
@@ -19,32 +20,10 @@ from geofleet.formats.text_tables import delimiter_of, encoding_of, header_line,
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-THINGS = (
-    *("time", "date", "week", "tow", "x", "y", "height", "speed", "quality", "satellites"),
-    *("sigma_e", "sigma_n", "drive"),
-)
 _OPTIONS = ("crs", "origin", "time_format", "day_first", "delimiter", "encoding")
-# Compared in lower case, letters and digits only; most telling first
-_NAMES = {
-    "time": "tutc utc utime timestamp timestampns unixtime datetime time gpstime timeutc epoch zeit zeitstempel heure "
-    "t",
-    "date": "date datum",
-    "week": "week gpsweek weeknumber wn",
-    "tow": "tow gpstow sow gpssow timeofweek",
-    "x": "lon longitude lng long londeg lngdeg longitudedeg längengrad laengengrad länge laenge",
-    "y": "lat latitude latdeg latitudedeg breitengrad breite",
-    "height": "ellipsoidheight ellipsoidalheight heightellipsoidal heightm height",
-    "quality": "fixquality quality fix q",
-    "satellites": "nsatellites numsatellites satellites nsat nsats numsat numsats numsv ns",
-    "sigma_e": "sigmaem sigmae sde sdem",
-    "sigma_n": "sigmanm sigman sdn sdnm",
-    "drive": "driveid drive tripid trip trackid vehicleid vehicle carid deviceid",
-}
 _BLANKS = r"\s+"
-# What a name may have around it: `%time,field.latitude` of rostopic, and units that change nothing
-_AROUND = re.compile(r"^(?:%|field\.)|\s*[(\[](?:s|sec|deg|degrees|°|m)[)\]]$", re.IGNORECASE)
-# Of coordinates that are not degrees, which only a CRS can tell
-_PROJECTED_NAMES = {"x": "x easting xm e rechtswert utmx utmeasting", "y": "y northing ym n hochwert utmy utmnorthing"}
+_COMMENT = "#"
+_VALUE = re.compile(r"[+-]?\d+(?:[.,]\d*)?(?:[eE][+-]?\d+)?|\d{4}-\d\d-\d\d.*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,8 +71,8 @@ def detect(head: bytes) -> bool:
     header, _ = _header(line)
     if _profile(line, header):
         return True
-    guessed = _guess(header, {}, is_projected=False)
-    return {"x", "y"} <= guessed.keys() and bool({"time", "tow"} & guessed.keys())
+    guessed = guess_columns(header, {}, is_projected=False)
+    return {"x", "y"} <= guessed.keys() and bool({"time", "tow", "year"} & guessed.keys())
 
 
 @cache
@@ -104,7 +83,7 @@ def profiles() -> dict[str, dict[str, Any]]:
 
 def columns_of(head: bytes) -> list[str]:
     """Return what the columns are called that a file's first bytes show."""
-    return _split(_first_line(head)[0])
+    return _header(_first_line(head)[0])[0]
 
 
 def layout_of(path: Path, columns: Mapping[str, str] | Path | None, *, is_projected: bool = False) -> Layout:
@@ -128,34 +107,31 @@ def layout_of(path: Path, columns: Mapping[str, str] | Path | None, *, is_projec
     """
     given, options = _given(columns)
     line, n_before = _first_line(read_head(path))
+    is_comment = line.startswith(_COMMENT)
     header, delimiter = _header(line, str(options.get("delimiter") or ""))
     name = _profile(line, header)
     profile = profiles()[name] if name else {}
     names = tuple(profile.get("names", ()))
+    n_before += is_comment
     known = names or tuple(header)
     for thing, column in given.items():
         if column not in known:
             raise ConfigError(f"there is no column {column!r} for {thing}.", todo=f"Columns are {', '.join(known)}.")
     told = [f"profile {name} ({profile['about']})"] if name else []
     base = profile.get("columns", {})
-    guessed = (
-        {} if name else _guess(header, given, is_projected=is_projected or bool({"crs", "origin"} & options.keys()))
-    )
+    knows_crs = is_projected or bool({"crs", "origin"} & options.keys())
+    guessed = {} if name else guess_columns(header, given, is_projected=knows_crs)
     told += [f"{thing} read from column {column} (guessed)" for thing, column in guessed.items()]
     merged = {thing: column for thing, column in (guessed | base | given).items() if column in known}
-    if not {"x", "y"} <= merged.keys():
-        raise InputError(
-            f"no columns that look like a position; there are {', '.join(known)[:300]}.",
-            where=str(path),
-            todo="Name them, and the CRS where they are not degrees: --columns time=…,x=…,y=… --crs ….",
-        )
+    if not ({"x", "y"} <= merged.keys() or "lat_lon" in merged):
+        raise _no_position(path, known)
     origin = options.get("origin") or profile.get("origin")
     return Layout(
         columns=merged,
         encoding=str(options.get("encoding") or encoding_of(path)),
         n_before=n_before,
         delimiter=_BLANKS if profile.get("prefix") else delimiter,
-        names=names,
+        names=names or (tuple(header) if is_comment else ()),
         prefix=str(profile.get("prefix", "")),
         crs=options.get("crs") or (None if options.get("origin") else profile.get("crs")),
         origin=None if options.get("crs") or not origin else (float(origin[0]), float(origin[1])),
@@ -200,35 +176,41 @@ def _profile(line: str, header: list[str]) -> str:
     return fitting[0] if len(fitting) == 1 else ""
 
 
-def _guess(header: list[str], given: Mapping[str, str], *, is_projected: bool) -> dict[str, str]:
-    """Return a column for each thing that is not given, by its name; a date without a time of day beside it is one."""
-    plain = {re.sub(r"[\W_]+", "", _AROUND.sub("", name.lower())): name for name in reversed(header)}
-    taken = set(given.values())
-    guessed = {}
-    for thing, names in _NAMES.items():
-        wanted = f"{names} {_PROJECTED_NAMES.get(thing, '')}" if is_projected else names
-        name = next((plain[n] for n in wanted.split() if n in plain and plain[n] not in taken), "")
-        if name and thing not in given and not (thing == "time" and "tow" in given):
-            guessed[thing] = name
-            taken.add(name)
-    if "time" in guessed or not {"week", "tow"} <= guessed.keys() | given.keys():
-        guessed = {thing: name for thing, name in guessed.items() if thing not in {"week", "tow"}}
-    if "date" in guessed and not {"time", "tow"} & (guessed.keys() | given.keys()):
-        guessed["time"] = guessed.pop("date")
-    return guessed
+def _no_position(path: Path, known: tuple[str, ...]) -> InputError:
+    """Return what is wrong with a first line that names no position: it may be no line of names."""
+    if 2 * sum(bool(_VALUE.fullmatch(name)) for name in known) >= len(known):
+        return InputError(
+            f"the first line names no columns, it holds values ({', '.join(known)[:100]}).",
+            where=str(path),
+            todo="Put a line of names above it, such as time,lat,lon,height.",
+        )
+    return InputError(
+        f"no columns that look like a position; there are {', '.join(known)[:300]}.",
+        where=str(path),
+        todo="Name them, and the CRS where they are not degrees: --columns time=…,x=…,y=… --crs ….",
+    )
 
 
 def _header(line: str, delimiter: str = "") -> tuple[list[str], str]:
     """Return the names of a first line and what stands between them: blanks where nothing else does and a place is."""
+    line = line.lstrip(_COMMENT + " ")
     found = delimiter or delimiter_of(line)
     names, words = _split(line, found), line.split()
-    if not delimiter and len(names) == 1 and {"x", "y"} <= _guess(words, {}, is_projected=True).keys():
+    if not delimiter and len(names) == 1 and {"x", "y"} <= guess_columns(words, {}, is_projected=True).keys():
         return words, _BLANKS
     return names, found
 
 
 def _first_line(head: bytes) -> tuple[str, int]:
-    return header_line(iter(text_of_head(head).splitlines()))
+    """Return the line that names the columns and how many come before it; a comment does where values follow it."""
+    lines = text_of_head(head).splitlines()
+    line, n_before = header_line(iter(lines))
+    above = lines[n_before - 1] if n_before else ""
+    if above.startswith(_COMMENT) and len(names := _header(above)[0]) > 1:
+        values = line.split() if _header(above)[1] == _BLANKS else _split(line, _header(above)[1])
+        if len(values) == len(names) and sum(bool(_VALUE.fullmatch(value)) for value in values) > 1:
+            return above, n_before - 1
+    return line, n_before
 
 
 def _split(line: str, delimiter: str = "") -> list[str]:

@@ -44,6 +44,17 @@ def local_crs(crs: str | None, origin: tuple[float, float] | None, utm: tuple[st
     return LocalCrs(*utm_around(*origin))
 
 
+def is_geographic(crs: str) -> bool:
+    """Tell whether a CRS is in degrees; an unknown one is not."""
+    from pyproj import CRS  # noqa: PLC0415  (takes a moment to load)
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
+    try:
+        return bool(CRS.from_user_input(crs).is_geographic)
+    except CRSError:
+        return False
+
+
 def to_places(x: Floats, y: Floats, z: Floats, local: LocalCrs, *, where: str) -> tuple[Floats, Floats, Floats]:
     """Return longitude and latitude in degrees and height in metres; NaN where there is no such place.
 

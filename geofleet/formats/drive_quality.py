@@ -34,6 +34,7 @@ GAP_STEPS, GAP_M = 10.0, 20.0  # of places without a clock
 STANDING_M = 0.3
 FIXED, FLOAT = "fixed", "float"
 WRONG_FIXES = f"wrong fixes: they do not hold, and fewer than {BACKING_SATELLITES} satellites back them"
+JUMPS = "impossible jumps"
 _GEOD = Geod(ellps="WGS84")
 
 
@@ -121,7 +122,7 @@ def _credible(epochs: Epochs) -> tuple[Epochs, dict[str, int], dict[str, int]]:
     hasty = hasty_fixes(t_s, is_fixed, segment)
     wrong = unbacked_fixes(hasty, epochs.n_satellites)
     epochs = replace(epochs, quality=np.where(hasty, FLOAT, epochs.quality))
-    skipped = {"impossible jumps": int(jump.sum()), WRONG_FIXES: int(wrong.sum())}
+    skipped = {JUMPS: int(jump.sum()), WRONG_FIXES: int(wrong.sum())}
     found = {"fixes that do not hold, called float": int((hasty & ~wrong).sum())}
     if is_fixed.any():
         held_s = np.concatenate((t_s[:1], t_s[is_fixed & ~hasty], t_s[-1:]))

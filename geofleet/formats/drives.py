@@ -1,4 +1,4 @@
-"""Trajectories as `drives`: RTKLIB solutions, NMEA, GPX and CSV, told by their content, under one quality control.
+"""Trajectories as `drives`: RTKLIB, NMEA, GPX, CSV and others, told by their content, under one quality control.
 
 Times become UTC (GPS time is ahead by the leap seconds of its day), gaps start a segment, duplicate epochs, impossible
 jumps and what lies inside of a stop are left out and counted, heading and speed come from the motion.
@@ -13,10 +13,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from geofleet.errors import ConfigError, InputError
-from geofleet.formats import drive_csv, drive_layout, gpx, inventory_files, nmea, rtklib
+from geofleet.errors import SUSPICIOUS, ConfigError, InputError
+from geofleet.formats import (
+    drive_csv,
+    drive_features,
+    drive_layout,
+    gnss_logger,
+    gpx,
+    inventory_files,
+    nmea,
+    rtklib,
+)
 from geofleet.formats.datum import datum_of
-from geofleet.formats.drive_quality import judge_epochs
+from geofleet.formats.drive_quality import JUMPS, judge_epochs
+from geofleet.formats.foreign import refuse_foreign
 from geofleet.formats.positions import PlaceCheck, area_doubt, reject_null_island
 from geofleet.formats.reading import Datum, LayerRead, content_head, read_head, unpacked
 from geofleet.formats.text_tables import is_header
@@ -32,19 +42,31 @@ if TYPE_CHECKING:
 
 __all__ = ["FORMATS", "detect", "read_drive"]
 
-RTKLIB, NMEA, GPX, CSV = "rtklib", "nmea", "gpx", "csv"
+RTKLIB, NMEA, GPX, GNSS_LOGGER, GIS, CSV = "rtklib", "nmea", "gpx", "gnsslogger", "gis", "csv"
 FORMATS = {
     RTKLIB: "RTKLIB solution (.pos)",
     NMEA: "NMEA 0183 log with GGA or RMC",
     GPX: "GPX track or route",
+    GNSS_LOGGER: "fixes of Android's GnssLogger",
+    GIS: "GeoJSON, GeoPackage, Shapefile or FlatGeobuf with points that have a time, or lines",
     CSV: "CSV or columns of numbers, with a profile or columns named",
 }
+_MOSTLY_JUMPS = (
+    f"{SUSPICIOUS}left out as impossible jumps, the most of a drive; are its times and their unit right (time_format)?"
+)
 _AS_RECEIVED = Datum(
     "OGC:CRS84",
     "none: taken as WGS 84, but corrected positions (RTK, PPP) are in the datum of their base stations, such as ETRS89",
     None,
 )
-DETECTORS = {RTKLIB: rtklib.detect, GPX: gpx.detect, NMEA: nmea.detect, CSV: drive_csv.detect}
+DETECTORS = {
+    RTKLIB: rtklib.detect,
+    GPX: gpx.detect,
+    NMEA: nmea.detect,
+    GNSS_LOGGER: gnss_logger.detect,
+    CSV: drive_csv.detect,
+}
+_READERS = {RTKLIB: rtklib.read_epochs, NMEA: nmea.read_epochs, GNSS_LOGGER: gnss_logger.read_epochs}
 
 
 def detect(head: bytes) -> str:
@@ -65,7 +87,11 @@ def recognise(path: Path) -> str:
     head = content_head(path)
     if found := detect(head):
         return found
-    return CSV if inventory_files.detect(head) == CSV and is_header(drive_layout.columns_of(head)) else ""
+    refuse_foreign(path)
+    of_map = inventory_files.detect(head)
+    if of_map in drive_features.FORMATS:
+        return GIS
+    return CSV if of_map == CSV and is_header(drive_layout.columns_of(head)) else ""
 
 
 def read_drive(
@@ -105,9 +131,8 @@ def _read_drive(path: Path, file_format: str, **given: Any) -> LayerRead:
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if file_format == "auto" and options and not found_format:
         found_format = CSV
-    if found_format not in FORMATS or not (
-        file_format == "auto" or DETECTORS[found_format](head) or options or found_format == CSV
-    ):
+    is_known = found_format in {CSV, GIS} or (found_format in DETECTORS and DETECTORS[found_format](head))
+    if not (is_known or (found_format in FORMATS and (file_format == "auto" or options))):
         raise InputError(
             f"not {FORMATS.get(file_format, 'a trajectory in a format that is read here')}.",
             where=str(path),
@@ -121,9 +146,11 @@ def _read_drive(path: Path, file_format: str, **given: Any) -> LayerRead:
         crs = drive_csv.stated_crs(path, **options)
     elif found_format == GPX:
         drives, skipped, found = gpx.read_epochs(path)
+    elif found_format == GIS:
+        drives, skipped, found, crs = drive_features.read_epochs(path)
     else:
-        epochs, skipped, *notes = (rtklib if found_format == RTKLIB else nmea).read_epochs(path)
-        drives, found = {"": epochs}, notes[0] if notes else {}
+        epochs, skipped, found = _READERS[found_format](path)
+        drives = {"": epochs}
     layer = _layer(path, found_format, drives, Counter(skipped), Counter(found))
     place = lonlat(layer.table)
     check = PlaceCheck(str(path))
@@ -139,6 +166,8 @@ def _layer(
     for name, epochs in drives.items():
         reject_null_island(epochs.lon, epochs.lat, where=str(path))
         judged = judge_epochs(epochs)
+        if 2 * judged.skipped.get(JUMPS, 0) > len(epochs.lon):
+            found[_MOSTLY_JUMPS] += judged.skipped[JUMPS]
         skipped.update(judged.skipped)
         found.update(judged.found)
         columns = _columns(judged, f"{path.stem}-{name}" if name else path.stem, path.name)

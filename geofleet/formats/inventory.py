@@ -146,7 +146,7 @@ def _no_code(path: Path, names: Sequence[str]) -> InputError:
     return InputError(
         f"no column looks like the code of a sign; there are {', '.join(names)[:300]}.",
         where=str(path),
-        todo="Name it: --columns code=….",
+        todo="Name it: --columns code=…. If it holds no signs, say what it is: info --table drives.",
     )
 
 

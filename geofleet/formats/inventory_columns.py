@@ -104,8 +104,13 @@ _DATE = re.compile(r"(\d{1,4})[-/.](\d{1,2})[-/.](\d{1,4})(?:[ T](.+))?")
 # The O of a German east is that of a French west, the s of seconds that of the south: left out
 _ANGLE = re.compile(
     r"(?P<before>[NSEW+-])?\s*(?P<degrees>\d{1,3}(?:\.\d+)?)(?P<degree>\s*[°º:]?\s*)"
-    r"(?:(?P<minutes>\d{1,2}(?:\.\d+)?)\s*['\u2032\u2019:]?\s*)?(?:(?P<seconds>\d{1,2}(?:\.\d+)?)\s*(?:[\"\u2033\u201d]|'')?)?\s*"
+    r"(?:(?<=[\s°º:])(?P<minutes>\d{1,2}(?:\.\d+)?)\s*['\u2032\u2019:]?\s*"
+    r"(?:(?P<seconds>\d{1,2}(?:\.\d+)?)\s*(?:[\"\u2033\u201d]|'')?)?)?\s*"
     r"(?P<after>[NSEW])?"
+)
+# Four or five figures before the point are degrees and minutes of NMEA: 4806.1234N is no 480 degrees
+_NMEA_ANGLE = re.compile(
+    r"(?P<before>[NSEW])?\s*(?P<degrees>\d{2,3})(?P<degree>)(?P<minutes>\d{2}(?:\.\d*)?)(?P<seconds>)\s*(?P<after>[NSEW])?"
 )
 _EPOCH_MS, _EPOCH_S = 1e11, 1e8
 _MONTHS, _LAST_YEAR = 12, 9999
@@ -226,7 +231,7 @@ def coordinates(table: pa.Table, name: str) -> Floats:
     if len(lost) and not pa.types.is_floating(table[name].type):
         text = texts(table, name)
         found = found.copy()
-        found[lost] = [_angle(text[row] or "") for row in lost]
+        found[lost] = [angle(text[row] or "") for row in lost]
     return found
 
 
@@ -238,9 +243,10 @@ def paired_coordinates(table: pa.Table, name: str) -> tuple[Floats, Floats]:
     return (first, second) if _LON_FIRST.match(name) else (second, first)
 
 
-def _angle(text: str) -> float:
-    """Return `52°30'36.5" N`, `52 30.61 N`, `N 52:30:36`, `52.51 N` or the like as degrees, NaN when it is none."""
-    match = _ANGLE.fullmatch(text.strip().upper().replace(",", "."))
+def angle(text: str) -> float:
+    """Return `52°30'36.5" N`, `52 30.61 N`, `N 52:30:36`, `52.51 N`, `5230.61N` or the like as degrees, else NaN."""
+    plain = text.strip().upper().replace(",", ".")
+    match = _NMEA_ANGLE.fullmatch(plain) or _ANGLE.fullmatch(plain)
     if not match or not (match["degree"].strip() or match["before"] or match["after"]):
         return np.nan
     degrees, minutes, seconds = (float(match[part] or 0.0) for part in ("degrees", "minutes", "seconds"))

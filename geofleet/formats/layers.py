@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats import osm
+from geofleet.formats.foreign import refuse_foreign
 from geofleet.formats.osm_value import is_own_osm
 from geofleet.formats.reading import (
     BZIP2,
@@ -104,6 +105,7 @@ def recognise(path: Path) -> str:
             return recognise(plain)
     if head.startswith(b"PAR1"):
         return _OWN if _is_own_table(path) else _INVENTORY
+    refuse_foreign(path)
     if root_tag(unpacked_head(path) if head.startswith((GZIP, BZIP2)) else head) == "OpenDRIVE":
         return _OPENDRIVE
     return _recognise_map(path, head) or (_INVENTORY if _is_inventory(head) else "")

@@ -6,6 +6,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from geofleet.errors import ConfigError, GeofleetError, InputError
@@ -117,20 +118,29 @@ def kind_of(path: Path) -> str:
 
 def _kind_of_rows(path: Path, *, is_drive: bool) -> str:
     """Tell detections, drives, lanes and inventories apart by what their columns are called."""
-    from geofleet.formats.detection_columns import choose_columns  # noqa: PLC0415  (as above)
+    from geofleet.formats import drive_features  # noqa: PLC0415  (as above)
+    from geofleet.formats.detection_columns import choose_columns  # noqa: PLC0415
     from geofleet.formats.detection_files import read_batches  # noqa: PLC0415
 
     try:
-        names = next(read_batches(path)).table.column_names
-        chosen = choose_columns(names, {}, has_geometry=True)[0].keys()
+        rows = next(read_batches(path)).table
+        names = rows.column_names
+        chosen = choose_columns(names, {}, has_geometry=True)[0]
     except (InputError, StopIteration):  # not a format that detections come in: its own reader will say more
         return DRIVES.name if is_drive else LANES.name if _holds_lanes(path) else SIGNS.name
     if {column.name for column in LANES.columns if not column.nullable} <= set(names):
         return LANES.name
-    if chosen & _OF_CODES:
-        is_layer = set(SIGNS.key) <= set(names)
-        return DETECTIONS.name if chosen & _OF_FLEETS and not is_layer else SIGNS.name
-    return DRIVES.name if is_drive else SIGNS.name
+    if chosen.keys() & _OF_CODES:
+        is_fleet = bool(chosen.keys() & _OF_FLEETS) and not set(SIGNS.key) <= set(names)
+        if is_fleet and is_drive and _is_blank(rows, [chosen[name] for name in _OF_CODES & chosen.keys()]):
+            return DRIVES.name
+        return DETECTIONS.name if is_fleet else SIGNS.name
+    return DRIVES.name if is_drive or drive_features.holds_drive(names) else SIGNS.name
+
+
+def _is_blank(rows: pa.Table, columns: list[str]) -> bool:
+    """Tell whether no row has a text in some columns: no detection is without a class."""
+    return all(pc.all(pc.equal(rows[name].cast(pa.string()).fill_null(""), "")).as_py() for name in columns)
 
 
 def _holds_lanes(path: Path) -> bool:
