@@ -30,7 +30,11 @@ class GeofleetError(Exception):
         What to do next.
     """
 
+    is_one_line = True
+
     def __init__(self, what: str, *, where: str = "", todo: str = "") -> None:
+        if self.is_one_line:  # texts of a damaged file may hold anything
+            what, where, todo = ("".join(c if c.isprintable() else " " for c in one) for one in (what, where, todo))
         self.what, self.where, self.todo = what, where, todo
         super().__init__(" ".join(part for part in (f"{where}: {what}" if where else what, todo) if part))
 
@@ -48,4 +52,6 @@ class ConfigError(GeofleetError):
 
 
 class QueryError(GeofleetError):
-    """An SQL statement failed."""
+    """An SQL statement failed; the message shows it."""
+
+    is_one_line = False

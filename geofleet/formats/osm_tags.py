@@ -235,8 +235,8 @@ def _meaning(plate: TaggedSign, tags: Mapping[str, str]) -> Meaning:
     if plate.code.startswith("max") and tags.get(plate.code):
         return taxonomy.meaning(f"{plate.code}[{tags[plate.code]}]", country=plate.country)
     meaning = taxonomy.meaning(plate.code, country=plate.country)
-    speed = taxonomy.concepts[meaning.concept].unit == "km/h" if meaning.known else False
-    if speed and meaning.value is None and tags.get("maxspeed"):
+    is_limit = meaning.group == "prohibition" and taxonomy.concepts[meaning.concept].unit == "km/h"
+    if is_limit and meaning.value is None and tags.get("maxspeed"):
         return taxonomy.meaning(f"{plate.code}[{tags['maxspeed']}]", country=plate.country)
     return meaning
 

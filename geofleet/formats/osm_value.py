@@ -50,11 +50,10 @@ def says(value: str) -> list[str]:
 
 
 def _candidates(sign_class: str, raw_code: str, country: str | None, value: float | None) -> Iterator[str]:
-    numbered = "" if value is None else f"[{value:g}{_unit(sign_class)}]"
+    numbered = () if value is None else tuple(f"[{value:g}{unit}]" for unit in _units(sign_class))
     for code in (*_own_codes(raw_code, country), *codes_of(sign_class.partition(":")[0], country=country, value=value)):
         yield code
-        if numbered:
-            yield code + numbered
+        yield from (code + bracket for bracket in numbered)
     if sign_class.startswith(RAW_PREFIX):
         yield from _own_codes(sign_class.removeprefix(RAW_PREFIX), country)
 
@@ -69,8 +68,9 @@ def _own_codes(raw_code: str, country: str | None) -> list[str]:
     return [named, raw_code] if any(letter.isdigit() for letter in raw_code) else [raw_code, named]
 
 
-def _unit(sign_class: str) -> str:
-    """Return the unit that a class names because it is not the usual one of its concept."""
-    concept, _, number = sign_class.partition(":")
-    is_known = concept in load_taxonomy().concepts
-    return number.lstrip("0123456789.e+-") if is_known else ""
+def _units(sign_class: str) -> tuple[str, ...]:
+    """Return how a class may write its unit: as it names it; if not, not at all, or as the concept has it."""
+    name, _, number = sign_class.partition(":")
+    concept = load_taxonomy().concepts.get(name)
+    named = number.lstrip("0123456789.e+-") if concept else ""
+    return (named,) if named or not concept else ("", f" {concept.unit}")

@@ -26,7 +26,14 @@ RAW_PREFIX = "raw:"
 OTHER_GROUP = "other"
 NUMBER = r"(?P<value>\d+(?:[.,]\d+)?)"
 _BEGIN = re.compile(r"(?:[\w ,:/-](?![?*+{]))*", re.ASCII)  # what stands for itself in a pattern
-_IN_BRACKET = re.compile(r"(?<![\w:])(\d+(?:[.,]\d+)?)\s*(km/h|mph|t|m|%)?(?![\w.:-])")
+_UNITS = "km/h|mph|kg|lbs|ft|st|t|km|mi|m|%"
+_NO_UNIT = r"(?!\s*(?:lb|cwt|in|cm|kN)\b)"  # what follows makes a number one that is not understood
+_IN_BRACKET = re.compile(rf"(?<![\w:])(\d+(?:[.,]\d+)?)(?:\s*({_UNITS}))?(?![\w.:'\u2032-]){_NO_UNIT}")
+_FEET = re.compile(
+    r"""(?<![\w:.,])(\d+)\s*(?:'|\u2032|ft\b\.?)-?\s*(?:(\d+(?:\.\d+)?)\s*(?:"|''|\u2033|in\b)?)?"""
+)  # 12'6"
+_INCHES = 12.0
+_USUAL = {"mph": "km/h", "ft": "m", "st": "t", "mi": "m"}  # a class names any other unit behind its number
 _LANELET2 = re.compile(r"([a-z]{2})([A-Z]*\d.*)")
 _REGION = re.compile(r"(?:[A-Z]{2,3}:\s*|§\s*)(?=\S)")  # a state or province, or the sign of a paragraph
 _MAPILLARY_VARIANT = re.compile(r"--g\d+$")
@@ -145,7 +152,8 @@ def load_taxonomy() -> Taxonomy:
     concepts: dict[str, Concept] = {}
     rules = []
     for row in csv.DictReader(text.splitlines()):
-        concept = concepts.setdefault(row["concept"], Concept(row["concept"], row["group"], row["kind"], row["unit"]))
+        unit = _USUAL.get(row["unit"], row["unit"])
+        concept = concepts.setdefault(row["concept"], Concept(row["concept"], row["group"], row["kind"], unit))
         pattern = row["code_pattern"].replace("{n}", NUMBER, 1).replace("{n}", r"\d+")
         rules.append(_Rule(concept, pattern, row["value_rule"], row["unit"], row["scheme"], row["country"]))
     return Taxonomy(concepts, tuple(rules))
@@ -253,7 +261,11 @@ def _value(rule: _Rule, match: re.Match[str], code: str) -> tuple[float | None, 
     if own:
         return float(own.replace(",", ".")), rule.unit
     bracket = re.search(r"[\[(](.*)[\])]?", code)
-    found = _IN_BRACKET.search(bracket[1].rstrip("])")) if bracket else None
+    inside = bracket[1].rstrip("])") if bracket else ""
+    feet = _FEET.search(inside)
+    if feet:
+        return float(feet[1]) + float(feet[2] or 0) / _INCHES, "ft"
+    found = _IN_BRACKET.search(inside)
     if not found:
         return None, None
     return float(found[1].replace(",", ".")), found[2] or rule.unit

@@ -572,7 +572,7 @@ def test_traps(shared_data):
         read_signs(folder / "carla_Town01_partial_georef.xodr")
     mixed = read_signs(folder / "bssd_analyze_signal_elements.xodr", origin=ORIGIN).table.to_pylist()
     assert Counter(row["country"] for row in mixed) == {"DE": 6, "US": 1, None: 1}
-    assert {row["sign_class"] for row in mixed} >= {"speed_limit:50", "no_entry", "raw:R2-10", "raw:274-80"}
+    assert {row["sign_class"] for row in mixed} >= {"speed_limit:50", "no_entry", "regulatory_text", "raw:274-80"}
     letters = read_signs(folder / "esmini_straight_500m_signs.xodr", origin=ORIGIN).table.to_pylist()
     assert len(letters) == 19
     assert Counter(row["country"] for row in letters) == {"SE": 9, "DE": 7, "CN": 2, None: 1}

@@ -213,3 +213,9 @@ def test_years_of_no_clock_are_no_times(tmp_path):
         far = info(tmp_path / "far.parquet")
         assert far.t_first.startswith("2001-09-09")
         assert [n for name, n in far.found.items() if name.startswith(said)] == [1]
+
+
+def test_a_message_is_one_line_whatever_the_file_holds(tmp_path):
+    path = tmp_path / "signs.csv"
+    path.write_text('id,"code\n\x1b[31mred\r\n",place\n1,206,here\n')
+    assert not survives("signs", path, tmp_path / "out" / "out.parquet")

@@ -1,9 +1,10 @@
 """Codes against what the public lists say: those that were once wrong, and their neighbours.
 
 Vienna: annex 1 of the Convention on Road Signs and Signals as amended in 1995. France: the order of 24 November 1967.
-Belgium: the royal order of 1 December 1975. United States: tables 2B-1 and 2C-1 of the MUTCD. Finland: annex 3 of the
-Road Traffic Act 729/2018, and the decree 182/1982 that it took the place of, as the Finnish road agency lists them.
-OpenStreetMap: the words of its wiki's page on `traffic_sign`.
+Belgium: the royal order of 1 December 1975. United States: tables 2B-1, 2C-1, 2I-1, 7B-1, 8B-1 and 9A-1 of the MUTCD of
+2023, figure 2B-4 of that of 2009. The Netherlands: annex 1 of the RVV 1990. Switzerland: annex 2 of the SSV. Finland:
+annex 3 of the Road Traffic Act 729/2018, and the decree 182/1982 that it took the place of, as the Finnish road agency
+lists them. OpenStreetMap: the words of its wiki's page on `traffic_sign`.
 """
 
 from __future__ import annotations
@@ -43,13 +44,156 @@ BELGIUM = {
     "B3": "yield_ahead", "B5": "stop", "B7": "stop_ahead", "C7": "no_motorcycles", "C13": "no_animal_carts",
     "C15": "no_riding", "C17": "no_handcarts", "C19": "no_pedestrians", "C22": "no_buses", "C27": "width_limit",
     "C29": "height_limit", "F18": "bus_lane", "F19": "one_way", "F43": "place_name", "F4a": "speed_zone",
+    "A7b": "road_narrows_left", "A7c": "road_narrows_right", "B13": "end_priority_road",
+    "C5-C7-C9": "no_motor_vehicles",
+    "C31a": "no_left_turn", "C31g": "no_left_turn", "C31d": "no_right_turn", "C47": "toll", "D05": "roundabout",
+    "D1a": "direction_ahead", "E9a": "parking", "E9f": "parking_on_sidewalk", "E9g": "parking", "E11":
+    "alternate_parking", "F13": "lane_arrangement", "F15": "lane_arrangement", "F21": "pass_either_side",
+    "F39": "direction_sign", "F47": "end_road_works", "F50bis": "bicycle_crossing", "F59": "parking", "F62": "service",
+    "F81": "lanes_merge", "F85": "two_way_traffic", "F91": "lane_arrangement", "F95": "escape_lane",
+    "F98": "emergency_bay",
 }  # fmt: skip
 UNITED_STATES = {
-    "R3-1": "no_right_turn", "R3-2": "no_left_turn", "R3-4": "no_u_turn", "R3-17": "cycle_lane",
-    "R4-1": "no_overtaking", "R4-2": "end_no_overtaking", "R4-7a": "keep_right", "R4-8": "keep_left",
-    "R5-1": "no_entry", "R5-2": "no_trucks", "R5-3": "no_motor_vehicles", "R5-6": "no_bicycles",
-    "R5-8": "no_motorcycles", "R5-10b": "no_pedestrians_bicycles", "R5-10c": "no_pedestrians", "R6-2": "one_way",
-    "R8-5": "no_stopping", "R9-14": "no_riding", "R9-15": "no_snowmobiles", "W8-2": "uneven_road",
+    "R3-1": "no_right_turn",
+    "R3-2": "no_left_turn",
+    "R3-4": "no_u_turn",
+    "R3-17": "cycle_lane",
+    "R4-1": "no_overtaking",
+    "R4-2": "end_no_overtaking",
+    "R4-7a": "keep_right",
+    "R4-8": "keep_left",
+    "R5-1": "no_entry",
+    "R5-2": "no_trucks",
+    "R5-3": "no_motor_vehicles",
+    "R5-6": "no_bicycles",
+    "R5-8": "no_motorcycles",
+    "R5-10b": "no_pedestrians_bicycles",
+    "R5-10c": "no_pedestrians",
+    "R6-2": "one_way",
+    "R8-5": "no_stopping",
+    "R9-14": "no_riding",
+    "R9-15": "no_snowmobiles",
+    "W8-2": "uneven_road",
+    "R1-5b": "pedestrian_crossing",
+    "R1-9a": "pedestrian_crossing",
+    "R2-13": "end_speed_limit",
+    "R3-1c": "no_right_turn",
+    "R3-3": "no_turns",
+    "R3-5": "lane_use",
+    "R3-5L": "turn_left_ahead",
+    "R3-5a": "straight_only",
+    "R3-5bP": "plate_other",
+    "R3-7R": "lane_use",
+    "R3-7bP": "plate_except",
+    "R3-9b": "lane_use",
+    "R3-14": "preferential_lane",
+    "R3-27": "no_straight",
+    "R4-10": "escape_lane",
+    "R4-16": "lane_use",
+    "R5-1a": "no_entry",
+    "R5-2b": "no_trucks",
+    "R5-10": "no_pedestrians_bicycles_mopeds",
+    "R6-3": "divided_road",
+    "R6-6": "one_way",
+    "R7-8": "parking",
+    "R7-8aP": "plate_other",
+    "R7-107a": "no_parking",
+    "R8-3a": "no_parking",
+    "R9-3": "no_pedestrians",
+    "R10-11": "regulatory_text",
+    "R10-18": "speed_camera",
+    "R10-19P": "plate_other",
+    "R11-3a": "no_vehicles",
+    "R12-2": "axle_load_limit",
+    "R14-2": "direction_sign",
+    "R15-1": "level_crossing_cross",
+    "R15-2P": "plate_other",
+    "S1-1": "children",
+    "S4-3P": "plate_other",
+    "S4-5": "speed_limit_ahead",
+    "S5-1": "speed_zone",
+    "W1-4": "double_curve",
+    "W1-10b": "curve",
+    "W2-4": "side_road",
+    "W3-5": "speed_limit_ahead",
+    "W3-6": "movable_bridge",
+    "W4-2R": "lanes_merge",
+    "W5-3": "road_narrows",
+    "W6-1": "divided_road",
+    "W7-4b": "escape_lane",
+    "W8-3": "pavement_ends",
+    "W8-8": "uneven_road",
+    "W8-17": "soft_verge",
+    "W8-17P": "plate_other",
+    "W8-26": "dead_end",
+    "W9-4": "lanes_merge",
+    "W10-3": "level_crossing_approach",
+    "W11-15": "warn_cyclists",
+    "W13-1P": "plate_advisory_speed",
+    "W13-2": "advisory_speed_warning",
+    "W14-2a": "dead_end",
+    "W16-7P": "plate_arrow",
+    "W16-20P": "plate_except",
+    "W19-3": "end_motorway",
+    "W20-1": "road_works",
+    "W20-7": "road_works",
+    "W26-1": "traffic_queue",
+    "OM3-L": "hazard_board",
+    "D9-7": "service",
+    "D10-2a": "location_marker",
+    "D11-1": "direction_sign",
+    "D11-1bP": "plate_other",
+    "G20-2": "end_road_works",
+    "M1-1": "direction_sign",
+}
+NETHERLANDS = {
+    "A1": "speed_limit",
+    "A2": "end_speed_limit",
+    "A4": "advisory_speed",
+    "B1": "priority_road",
+    "B05": "priority_at_next",
+    "B6": "yield",
+    "B7": "stop",
+    "C1": "no_vehicles",
+    "C2": "no_entry",
+    "C3": "one_way",
+    "C6": "no_cars",
+    "C12": "no_motor_vehicles",
+    "C15": "no_bicycles_mopeds",
+    "C20": "axle_load_limit",
+    "C22a": "environmental_zone",
+    "D1": "roundabout",
+    "D2": "pass_on_shown_side",
+    "D3": "pass_either_side",
+    "E1": "no_parking",
+    "E2": "no_stopping",
+    "E5": "taxi_rank",
+    "E8": "parking",
+    "F1": "no_overtaking",
+    "F5": "yield_to_oncoming",
+    "F6": "priority_over_oncoming",
+    "F7": "no_u_turn",
+    "F13": "bus_lane",
+    "G1": "motorway",
+    "G5": "living_street",
+    "G11": "cycleway",
+    "G12": "end_cycleway",
+    "H1": "built_up_area",
+    "J1": "uneven_road",
+    "J16": "road_works",
+    "J38": "bump",
+    "K6": "direction_sign",
+    "L2": "pedestrian_crossing",
+    "L8": "dead_end",
+    "OB501": "plate_other",
+}
+SWITZERLAND = {
+    "1.01": "curve_right", "1.13a": "falling_rocks", "1.22": "warn_pedestrian_crossing", "2.02": "no_entry", "2.14":
+    "no_motor_vehicles", "2.30": "speed_limit", "2.34": "keep_right", "2.41.1": "roundabout", "2.43": "no_left_turn",
+    "2.49": "no_stopping", "2.50": "no_parking", "2.53": "end_speed_limit", "2.59.1": "speed_zone", "2.59.2e":
+    "end_no_parking_zone", "2.59.5a": "living_street", "2.60": "cycleway", "2.63": "segregated_path", "2.63.1":
+    "shared_path", "3.01": "stop", "3.02": "yield", "3.03": "priority_road", "3.06": "priority_to_right", "4.01":
+    "motorway", "4.08": "one_way", "4.11": "pedestrian_crossing", "4.17": "parking", "4.24": "escape_lane",
 }  # fmt: skip
 FINLAND_2020 = {
     "A1.1": "curve_right", "A2.2": "double_curve_left", "A3.1": "steep_ascent", "A3.2": "steep_descent",
@@ -109,6 +253,8 @@ CASES = [
         ("fr", "FR", FRANCE),
         ("be", "BE", BELGIUM),
         ("mutcd", "US", UNITED_STATES),
+        ("rvv", "NL", NETHERLANDS),
+        ("ssv", "CH", SWITZERLAND),
         ("", "FI", FINLAND_2020),
         ("", "FI", FINLAND_1982),
         ("osm", "", OSM_WORDS),
@@ -125,3 +271,37 @@ def test_a_code_means_what_the_list_says(scheme, country, code, concept):
 @pytest.mark.parametrize(("scheme", "code"), [("vienna", "D,10a"), ("be", "D8"), ("be", "D6"), ("be", "A18")])
 def test_what_is_no_such_sign_is_not_known(scheme, code):
     assert not load_taxonomy().meaning(code, scheme=scheme).known
+
+
+@pytest.mark.parametrize(
+    ("country", "code", "sign_class"),
+    [
+        ("US", "W12-2[12'6\"]", "height_limit:12.5ft"), ("US", "W12-2[12'-6\"]", "height_limit:12.5ft"),
+        ("US", "W12-2a[13 ft 6 in]", "height_limit:13.5ft"), ("US", "W12-2[13]", "height_limit:13ft"),
+        ("US", "R12-1[10]", "weight_limit:10st"), ("US", "R12-1[20000 lbs]", "weight_limit:20000lbs"),
+        ("US", "R2-1[40 km/h]", "speed_limit:40"), ("US", "R2-1-35", "speed_limit:35mph"),
+        ("US", "W13-1P[35]", "plate_advisory_speed:35mph"), ("US", "W16-2aP[500]", "plate_distance:500ft"),
+        ("US", "S5-1[20]", "speed_zone:20mph"), ("US", "W3-5[45]", "speed_limit_ahead:45mph"),
+        ("GB", "maxheight[14'9\"]", "height_limit:14.75ft"), ("", "maxspeed[20 mph]", "speed_limit:20mph"),
+        ("BE", "C21[3500 kg]", "weight_limit:3500kg"), ("BE", "C43[50]", "speed_limit:50"),
+        ("DE", "1001[2 km]", "plate_length:2km"), ("DE", "265[3,8 m]", "height_limit:3.8"),
+        ("DE", "262[55 kN]", "weight_limit"), ("DE", "274[30 @ (22:00-06:00)]", "speed_limit:30"),
+        ("NL", "A1[30]", "speed_limit:30"), ("NL", "A1-50", "speed_limit:50"), ("NL", "A0130zb", "speed_zone:30"),
+        ("NL", "A01100", "speed_limit:100"), ("CH", "2.30[80]", "speed_limit:80"),
+        ("CH", "2.59.1[30]", "speed_zone:30"),
+        ("FR", "B14[50]", "speed_limit:50"), ("FI", "361[50]", "speed_limit:50"), ("DE", "274-30", "speed_limit:30"),
+    ],
+)  # fmt: skip
+def test_a_number_has_the_unit_of_its_sign(country, code, sign_class):
+    assert load_taxonomy().meaning(code, country=country).sign_class == sign_class
+
+
+def test_plates_of_the_united_states_are_no_main_signs():
+    """The designations of plaques end in P; two signs are plaques by design only."""
+    taxonomy = load_taxonomy()
+    plaques = (
+        "R1-2aP R2-4P R3-5gP R3-9cP R5-2aP R7-8aP R7-201P R9-3bP R10-20aP R15-2P W3-5aP W4-4P W7-3bP W8-5bP W10-1aP"
+    )
+    plaques += " W11-12P W13-1P W16-1P W16-2P W16-4P W16-9P W16-13P S4-1P D9-6P D12-1bP M2-1P G20-5aP"
+    assert {code for code in plaques.split() if taxonomy.meaning(code, country="US").kind != "plate"} == set()
+    assert taxonomy.meaning("R6-5P", country="US").concept == "roundabout"
