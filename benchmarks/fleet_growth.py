@@ -1,4 +1,4 @@
-"""Does F1 hold as passes grow to 2,000? The demo scene, DBSCAN's core rule fixed and following the densest place.
+"""Does F1 hold as passes grow to 2,000? The demo scene, DBSCAN's core fixed and following the densest place around.
 
     python benchmarks/fleet_growth.py --seed 11 --replicates 10
     python benchmarks/fleet_growth.py --seed 12 --replicates 10 --drive data/raw/helsinki_derived_b.pos
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from geofleet.algorithms import clustering
 from geofleet.config import load_config
 from geofleet.steps.aggregate import aggregate
 from geofleet.steps.evaluate import evaluate
@@ -42,7 +43,9 @@ def main() -> None:
     parser.add_argument(
         "--with-passes", action="store_true", help="support relative to the passes that had a place in view"
     )
+    parser.add_argument("--peak-steps", type=int, default=clustering.PEAK_STEPS, help="how far is around; 60: anywhere")
     args = parser.parse_args()
+    clustering.PEAK_STEPS = args.peak_steps
     with TemporaryDirectory() as name:
         folder = Path(name)
         ingest_signs([RAW / "helsinki.osm.pbf"], folder / "signs.parquet")

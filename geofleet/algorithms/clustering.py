@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 _CELL_SLACK = 1e-5
 _MAX_KEY_BITS = 62
 PEAK_SIGMAS = 2.0  # by which a count may fall short of its share of the largest one by chance
+PEAK_STEPS = 3  # of eps: as far as the detections of a sign reach out to others
 _PLANE = 2
 
 
@@ -132,10 +133,11 @@ def core_counts(peak: Ints, min_samples: int, share: float) -> Ints:
 def split_groups(
     xy: ArrayLike, groups: ArrayLike, *, eps_m: float, min_samples: int, share: float, ecef_m: Floats | None = None
 ) -> Ints:
-    """Cluster the points of each group anew with a core rule that follows its densest place.
+    """Cluster the points of each group anew with a core rule that follows the densest place around.
 
-    Where a point of the group has M neighbours within eps_m and none has more, a core has
-    max(min_samples, share M - 2 √M): a count of M varies by √M, so of few points hardly anything is asked.
+    Where M is the most neighbours within eps_m that any point has which is reached in PEAK_STEPS steps of eps_m from
+    point to point of the group, a core has max(min_samples, share M - 2 √M): a count of M varies by √M, so of few
+    points hardly anything is asked. What is farther away has no say, so that a busy place does not silence a quiet one.
 
     Parameters
     ----------
@@ -154,11 +156,15 @@ def split_groups(
     cells = _sort_into_cells(points, codes, points if ecef_m is None else ecef_m, eps_m)
     sq_eps = eps_m * eps_m
     counts = kernels.count_neighbours(cells, sq_eps)
-    starts = np.flatnonzero(np.diff(codes[cells.order], prepend=-1))
-    least = core_counts(np.maximum.reduceat(counts, starts), min_samples, share)
-    core = counts >= np.repeat(least, np.diff(np.append(starts, len(points))))
+    peak = counts
+    for _ in range(PEAK_STEPS):
+        peak = kernels.largest_near(cells, sq_eps, peak)
+    least = core_counts(peak, min_samples, share)
+    core = counts >= least
     labels, *_ = kernels.label_points(cells, core, kernels.number_clusters(cells, core, sq_eps), sq_eps)
-    return np.where(least[codes] > min_samples, labels, labels.max() + 1 + codes)
+    is_split = np.zeros(int(codes.max()) + 1, np.bool_)
+    is_split[codes[cells.order[least > min_samples]]] = True
+    return np.where(is_split[codes], labels, labels.max() + 1 + codes)
 
 
 def _checked(xy: ArrayLike) -> Floats:

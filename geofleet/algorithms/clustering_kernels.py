@@ -151,6 +151,28 @@ def count_neighbours(cells: Cells, sq_eps: float) -> Ints:
 
 
 @kernel
+def largest_near(cells: Cells, sq_eps: float, values: Ints) -> Ints:
+    """Return, in cell order, the largest value of a point within eps of each, itself included."""
+    largest = np.empty_like(values)
+    n_cells = cells.first.size - 1
+    of_cell = np.empty(n_cells, np.int64)
+    for cell in range(n_cells):
+        of_cell[cell] = values[cells.first[cell] : cells.first[cell + 1]].max()
+    for cell in range(n_cells):
+        for i in range(cells.first[cell], cells.first[cell + 1]):
+            best = of_cell[cell]
+            for row in range(N_ROWS):
+                for other in range(cells.window[cell, row, 0], cells.window[cell, row, 1]):
+                    if of_cell[other] <= best:
+                        continue
+                    for j in range(cells.first[other], cells.first[other + 1]):
+                        if values[j] > best and _sq_distance(cells.coords, i, j) <= sq_eps:
+                            best = values[j]
+            largest[i] = best
+    return largest
+
+
+@kernel
 def _root(parent: NDArray[np.int32], cell: int) -> int:
     while parent[cell] != cell:
         parent[cell] = parent[parent[cell]]

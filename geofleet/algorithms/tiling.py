@@ -201,13 +201,13 @@ def join_open(point: Ints, cluster: Ints, is_core: Flags, is_owned: Flags) -> tu
 def split_chains(
     lon_deg: Floats, lat_deg: Floats, cluster: Ints, *, eps_m: float, min_samples: int, share: float
 ) -> Ints:
-    """Cluster the members of each cluster anew with a core rule that follows its densest place.
+    """Cluster the members of each cluster anew with a core rule that follows the densest place around.
 
     The more passes, the more far-out detections: with a fixed core rule three of them bridge two signs of a class, and
     clusters grow into chains as fleets do. Around a sign detections are dense and between two signs they are not, so a
-    cluster is clustered again, by itself, with a core rule relative to its densest place (`clustering.split_groups`);
-    what is left over is noise. It asks for no scale of the errors and no size of the fleet. A cluster is known whole by
-    then, so that tiles do not show in this either.
+    cluster is clustered again, by itself, with a core rule relative to the densest place near
+    (`clustering.split_groups`); what is left over is noise. It asks for no scale of the errors and no size of the
+    fleet. A cluster is known whole by then, so that tiles do not show in this either.
 
     Parameters
     ----------

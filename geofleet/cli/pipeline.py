@@ -200,7 +200,7 @@ def report(
         ),
     ] = None,
     run_id: Annotated[str | None, typer.Option("--run-id", help="Draw a map of this run.")] = None,
-    method: Annotated[str | None, typer.Option(help="Draw a map of this method, e.g. dbscan-first.")] = None,
+    method: Annotated[str | None, typer.Option(help="Draw a map of this method, e.g. dbscan-peaks.")] = None,
     vehicles: Annotated[int | None, typer.Option("--vehicles", help="Draw a map of this fleet size.")] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -68,7 +68,7 @@ def _c(name: str, type_: pa.DataType, description: str) -> Column:
 
 
 RUN = _c("run_id", TEXT, "one scenario, seed and replicate; runs are never mixed")
-METHOD = _c("method", TEXT, "how the map was made, e.g. dbscan-first")
+METHOD = _c("method", TEXT, "how the map was made, e.g. dbscan-peaks")
 N_VEHICLES = _c("n_vehicles", INT, "the first n vehicles of the run were used; 0 for a map from elsewhere")
 
 _SIGN = (

@@ -9,9 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import Geod
+from scipy.sparse.csgraph import connected_components
 from sklearn.cluster import DBSCAN
 
-from geofleet.algorithms.clustering import dbscan
+from geofleet.algorithms import clustering
+from geofleet.algorithms.clustering import dbscan, split_groups
 from geofleet.algorithms.fusion import fuse, information_weights, name_hashes, vote
 from geofleet.algorithms.geodesy import EnuFrame, to_ecef
 from geofleet.algorithms.geodesy_kernels import ecef_points
@@ -269,6 +271,46 @@ def test_a_core_rule_that_follows_the_densest_place_splits_what_a_fixed_one_chai
     assert same_groups(split, dbscan(xy, 4.0, math.ceil(0.7 * most - 2 * math.sqrt(most))))
     first, second = (xy[split == label, 0] for label in np.unique(split[split >= 0]))
     assert sorted((round(first.mean() / gap_m, 1), round(second.mean() / gap_m, 1))) == [0.0, 1.0]
+
+
+def test_a_quiet_sign_in_a_chain_with_a_busy_one_is_kept(monkeypatch):
+    """Sixty passes report one, six hundred the other: with the core rule of the busy one the quiet one were noise."""
+    rng = np.random.default_rng(4)
+    xy = np.concatenate((rng.normal((0, 0), 1.7, (600, 2)), rng.normal((13, 0), 1.7, (60, 2))))
+    xy = xy[rng.permutation(660)]
+    places = EnuFrame(24.9, 60.2).to_lonlat(xy)
+    assert dbscan(xy, 4.0, 3).max() == 0  # one chain
+
+    def found():
+        split = split_chains(*places, np.zeros(660, np.int64), eps_m=4.0, min_samples=3, share=0.7)
+        return sorted(round(float(xy[split == label, 0].mean())) for label in np.unique(split[split >= 0]))
+
+    assert found() == [0, 13]
+    monkeypatch.setattr(clustering, "PEAK_STEPS", 60)
+    assert found() == [0]
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 10_000), n_signs=st.integers(1, 6), sigma_m=st.floats(0.5, 4), share=st.floats(0.3, 1))
+def test_the_core_rule_is_the_one_that_is_written_down(seed, n_signs, sigma_m, share):
+    rng = np.random.default_rng(seed)
+    n_seen = rng.integers(5, 120, n_signs)
+    xy = np.repeat(rng.uniform(0, 30, (n_signs, 2)), n_seen, axis=0) + rng.normal(0, sigma_m, (n_seen.sum(), 2))
+    labels = dbscan(xy, 4.0, 3)
+    xy, labels = xy[labels >= 0], labels[labels >= 0]
+    near = np.linalg.norm(xy[:, None] - xy[None], axis=2) <= 4.0
+    near &= labels[:, None] == labels[None]
+    count = near.sum(axis=1)
+    most = count
+    for _ in range(3):
+        most = np.where(near, most[None], 0).max(axis=1)
+    core = count >= np.maximum(3, np.ceil(share * most - 2 * np.sqrt(most)))
+    _, component = connected_components(near & core[:, None] & core[None])
+    found = split_groups(xy, labels, eps_m=4.0, min_samples=3, share=share) if len(xy) else labels
+    assert same_groups(found[core], component[core])
+    assert ((found >= 0) == (near & core[None]).any(axis=1)).all()  # borders, and nothing else besides
+    for row in np.flatnonzero(~core & (found >= 0)).tolist():
+        assert found[row] in found[near[row] & core]
 
 
 def test_the_rule_has_no_scale():

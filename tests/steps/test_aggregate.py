@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
 from pyproj import Geod
 from sklearn.cluster import DBSCAN
 
@@ -44,10 +50,10 @@ def make_detections(xy, *, frame=HELSINKI, run_id="run-a", **columns):
     return build_table(DETECTIONS, given | columns, geometry=frame.to_lonlat(np.asarray(xy, float).reshape(-1, 2)))
 
 
-def scene(seed=0, n_signs=60, frame=HELSINKI, run_id="run-a", n_seen=10):
+def scene(seed=0, n_signs=60, frame=HELSINKI, *, run_id="run-a", n_seen=10, reach_m=200, sigma_m=1.2):
     rng = np.random.default_rng(seed)
-    places = rng.uniform(-200, 200, (n_signs, 2))
-    xy = np.repeat(places, n_seen, axis=0) + rng.normal(0, 1.2, (n_seen * n_signs, 2))
+    places = rng.uniform(-reach_m, reach_m, (n_signs, 2))
+    xy = np.repeat(places, n_seen, axis=0) + rng.normal(0, sigma_m, (n_seen * n_signs, 2))
     classes = np.repeat(np.array(CLASSES)[rng.integers(0, 3, n_signs)], n_seen)
     flips = rng.random(len(xy)) < 0.1
     classes[flips] = np.array(CLASSES)[rng.integers(0, 3, flips.sum())]
@@ -85,6 +91,28 @@ def test_tiles_workers_batches_and_row_order_do_not_show(tmp_path, monkeypatch, 
     assert result.n_tiles > 60
 
 
+@settings(max_examples=6, phases=[Phase.generate])  # without shrinking, which takes minutes here
+@given(
+    st.integers(0, 10_000),
+    st.sampled_from(sorted(PLACES)),
+    st.sampled_from(["first", "after"]),
+    st.tuples(st.integers(12, 20), st.integers(20, 3000), st.integers(1, 4)),
+)
+def test_tiles_do_not_show_where_dense_places_ask_for_more(seed, place, semantic, how):
+    """Signs of a hundred detections, chained by a core of three; clusters across tiles are split as all others are."""
+    zoom, batch_rows, n_workers = how
+    table = scene(seed=seed, frame=PLACES[place], n_signs=30, n_seen=100, reach_m=60, sigma_m=1.8)
+    with TemporaryDirectory() as name, pytest.MonkeyPatch.context() as patch:
+        whole = run_on(Path(name), table, semantic=semantic, tile_zoom=12)
+        plain = run_on(Path(name), table, name="plain", semantic=semantic, tile_zoom=12, min_samples_share=0.0)
+        assert plain.out.read_bytes() != whole.out.read_bytes()
+        patch.setattr(tiles, "COARSER_BY", 0)
+        patch.setattr(tiles, "BATCH_ROWS", batch_rows)
+        mixed = table.take(np.random.default_rng(seed).permutation(table.num_rows))
+        parts = run_on(Path(name), mixed, name="parts", tile_zoom=zoom, n_workers=n_workers, semantic=semantic)
+        assert parts.out.read_bytes() == whole.out.read_bytes()
+
+
 @pytest.mark.parametrize("n_seen", [10, 80])
 def test_signs_are_the_clusters_of_scikit_learn(tmp_path, n_seen):
     table = scene(seed=8, n_seen=n_seen)
@@ -113,7 +141,7 @@ def test_a_sign_worked_out_by_hand(tmp_path):
     assert (sign["n_passes"], sign["n_detections"], sign["n_vehicles"]) == (3, 3, 3)
     assert (sign["kind"], sign["method"], sign["run_id"], sign["source"]) == (
         "main",
-        "dbscan-first",
+        "dbscan-peaks",
         "run-a",
         "geofleet",
     )
@@ -126,7 +154,26 @@ def test_class_by_vote_after_clustering(tmp_path):
     table = make_detections([[0, 0], [0, 1], [1, 0], [1, 1]], sign_class=["stop", "yield", "stop", "stop"])
     (sign,) = read_table(SIGNS, run_on(tmp_path, table, semantic="after").out).to_pylist()
     assert (sign["sign_class"], sign["class_confidence"], sign["n_detections"]) == ("stop", 0.75, 4)
-    assert (sign["value"], sign["unit"], sign["method"]) == (None, None, "dbscan-after")
+    assert (sign["value"], sign["unit"], sign["method"]) == (None, None, "dbscan-peaks-after")
+
+
+@pytest.mark.parametrize(
+    ("settings", "label"),
+    [
+        ({}, "dbscan-peaks"),
+        ({"semantic": "after"}, "dbscan-peaks-after"),
+        ({"min_samples": 3}, "dbscan-first"),
+        ({"min_samples": 3, "semantic": "after"}, "dbscan-after"),
+        ({"min_samples_share": 0.0}, "dbscan-first"),
+        ({"min_samples": 4, "min_samples_share": 0.5}, "dbscan-peaks"),
+        ({"method": "hdbscan"}, "hdbscan-first"),
+    ],
+)
+def test_a_layer_and_its_manifest_say_which_core_rule_made_it(tmp_path, settings, label):
+    result = run_on(tmp_path, scene(), **settings)
+    assert set(read_table(SIGNS, result.out)["method"].to_pylist()) == {label}
+    manifest = json.loads((tmp_path / "fused_manifest.json").read_text())
+    assert manifest["settings"]["label"] == label
 
 
 def test_support_counts_passes_not_detections(tmp_path):

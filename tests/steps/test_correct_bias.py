@@ -207,7 +207,7 @@ def test_a_layer_is_nearer_to_the_truth_and_says_what_was_taken_out(tmp_path):
         xy = frame.to_enu(*lonlat(fused))
         errors[correct] = np.sqrt(np.mean([np.min(((xy - s) ** 2).sum(axis=1)) for s in SIGNS_XY]))
     assert errors[True] < 0.1 < errors[False]
-    assert set(fused["method"].to_pylist()) == {"dbscan-first-corrected"}
+    assert set(fused["method"].to_pylist()) == {"dbscan-peaks-corrected"}
     assert any("bias of 12 passes is taken out" in note for note in result.notes)
 
 

@@ -130,6 +130,7 @@ def aggregate(
     n_signs = write_pieces(SIGNS, layer_pieces(clusters, _support(clusters, of_run, settings), labels), out)
     result = AggregateResult(
         out=out,
+        label=label,
         rejected=write_rejected(staged.rejected, out),
         run_ids=tuple(sorted(fleet)),
         n_vehicles=max(fleet.values(), default=0),

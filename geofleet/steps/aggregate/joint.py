@@ -79,6 +79,7 @@ def fuse_jointly(
         write_table(schema, pa.concat_tables(tables) if tables else schema.arrow().empty_table(), beside(out, name))
     result = AggregateResult(
         out=out,
+        label=label,
         rejected=write_rejected(staged.judged.rejected, out),
         run_ids=runs,
         n_vehicles=max(fleet.values(), default=0),

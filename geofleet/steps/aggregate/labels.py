@@ -13,7 +13,11 @@ if TYPE_CHECKING:
 
 
 def method_label(settings: AggregateConfig, k_from: Path | None, prior: Path | None) -> str:
-    """Return how the layer calls its method; where K came from and whether biases are taken out are part of it."""
+    """Return how the layer calls its method; the core rule, where K came from and whether biases are taken out show.
+
+    DBSCAN with one core rule everywhere is `dbscan-first` or `-after`, as in the paper; with the one that follows the
+    densest place (`min_samples_share`) it is `dbscan-peaks`, or `dbscan-peaks-after`: never the name of the other.
+    """
     if prior and settings.method != "joint":
         raise ConfigError(f"{settings.method} takes no prior map.", where="--prior", todo="Use --method joint.")
     if settings.method == "joint":
@@ -24,7 +28,7 @@ def method_label(settings: AggregateConfig, k_from: Path | None, prior: Path | N
                 todo="Leave them out.",
             )
         return "joint-prior" if prior else "joint"
-    label = f"{settings.method}-{settings.semantic}{'-corrected' * settings.correct_bias}"
+    label = f"{_clustering(settings)}{'-corrected' * settings.correct_bias}"
     if settings.method not in {"kmeans", "kmedoids"}:
         if k_from or settings.k:
             raise ConfigError(
@@ -40,3 +44,9 @@ def method_label(settings: AggregateConfig, k_from: Path | None, prior: Path | N
             todo="Use --k-from REFERENCE for the number of signs a class, or leave K out to have it chosen.",
         )
     return f"{label}-oracle-k" if k_from else f"{label}-k{settings.k}" if settings.k else label
+
+
+def _clustering(settings: AggregateConfig) -> str:
+    if settings.method == "dbscan" and settings.min_samples_share > 0:
+        return "dbscan-peaks" + "-after" * (settings.semantic == "after")
+    return f"{settings.method}-{settings.semantic}"

@@ -26,12 +26,13 @@ if TYPE_CHECKING:
 class AggregateResult:
     """What became of the detections.
 
-    `n_detections` and `n_rejected` count the whole table, `n_used` the vehicles asked for; signs are clusters with
-    enough passes. `n_tiles` is None where runs are estimated whole. `n_suspect_passes`, of joint fusion only, are those
-    far from what they declare.
+    `label` is what the layer calls its method. `n_detections` and `n_rejected` count the whole table, `n_used` the
+    vehicles asked for; signs are clusters with enough passes. `n_tiles` is None where runs are estimated whole.
+    `n_suspect_passes`, of joint fusion only, are those far from what they declare.
     """
 
     out: Path
+    label: str
     rejected: Path | None
     run_ids: tuple[str, ...]
     n_vehicles: int
@@ -116,6 +117,6 @@ def write_result_manifest(result: AggregateResult, inputs: Hashing, config: Conf
         step="aggregate",
         inputs=inputs,
         config_digest=config.digest("aggregate"),
-        settings=config.aggregate.model_dump(),
+        settings={**config.aggregate.model_dump(), "label": result.label},
         counts={name: getattr(result, name) for name in names},
     )
