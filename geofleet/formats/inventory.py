@@ -15,7 +15,7 @@ import numpy as np
 
 from geofleet.errors import ConfigError, InputError
 from geofleet.formats.datum import datum_of
-from geofleet.formats.inventory_codes import OSM, guess_country, is_osm, read_codes, read_osm, scheme_of
+from geofleet.formats.inventory_codes import OSM, guess_country, is_osm, plain_codes, read_codes, read_osm, scheme_of
 from geofleet.formats.inventory_columns import choose_columns, numbers, parse_facings, parse_times, read_options, texts
 from geofleet.formats.inventory_files import detect, read_features
 from geofleet.formats.inventory_layer import is_own_layer, own_lanes, own_layer
@@ -108,6 +108,9 @@ def read_lanes(path: Path) -> LayerRead:
 
 def _read(path: Path, features: Features, named: Mapping[str, str], options: Mapping[str, Any]) -> LayerRead:
     """Return the signs of the rows of a file."""
+    if not features.table.num_rows and features.skipped:
+        reasons = ", ".join(f"{n} {reason}" for reason, n in features.skipped.items())
+        raise InputError(f"no row can be read ({reasons}).", where=str(path), todo="Quote what holds the separator.")
     if not features.table.num_rows and not named:
         return LayerRead(build_table(SIGNS, {name: [] for name in _TEXTS}, _NO_PLACES), features.file_format)
     chosen, guessed = choose_columns(features.table.column_names, named, has_geometry=features.geometry is not None)
@@ -170,7 +173,7 @@ def _plates(
     table: pa.Table, chosen: InventoryColumns, places: Places, options: Mapping[str, Any]
 ) -> tuple[Plates, dict[str, int]]:
     """Return the plates of every point, and what was guessed about their codes."""
-    codes = texts(table, chosen.code)
+    codes = plain_codes(texts(table, chosen.code))
     country, scheme = options.get("country"), options.get("scheme")
     if scheme == OSM or (scheme is None and is_osm(chosen.code, codes, country)):
         return read_osm(_osm_tags(table, chosen), country), {}

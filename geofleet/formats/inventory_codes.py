@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from geofleet.formats.inventory_columns import NAMES
 from geofleet.formats.osm_tags import node_signs
 from geofleet.taxonomy import load_taxonomy
 
@@ -21,6 +23,8 @@ NO_CODE = "unknown"  # what the vocabulary calls a plate of which nobody says wh
 _STACK = re.compile(r"\s*[|;]\s*|\s+\+\s+")
 _COUNTRY_PREFIX = re.compile(r"[A-Z]{2}:")
 _PLAIN_NUMBER = re.compile(r"\d+(?:[.,]\d+)?(?:\s*(?:km/h|mph|t|m|%))?")
+_ARRAY = re.compile(r"\{([^{}:]*)\}|\[([^\[\]{}:\"]*)\]")  # of PostgreSQL; a list of Python
+_FAR_SHARE, _FAR_CODES = 0.8, 5  # of codes of a scheme that is not the one of the place
 _ENOUGH = 0.5  # share of codes that a scheme must know to be taken for theirs
 
 
@@ -66,6 +70,41 @@ class Plates:
         return country if 2 * count > counted.total() else None
 
 
+def plain_codes(codes: Iterable[str | None]) -> list[str | None]:
+    """Return codes that are nested in JSON, as a list of Python or an array of PostgreSQL as plain ones.
+
+    Of an object that is what it calls a code, with its value; several stand as a stack. Others stay as they are.
+    """
+    return [_plain_code(code) if code and code[0] in "[{" else code for code in codes]
+
+
+@cache
+def _plain_code(text: str) -> str:
+    if array := _ARRAY.fullmatch(text):
+        parts = (array[1] or array[2] or "").split(",")
+        return "|".join(part.strip().strip("'\"") for part in parts)
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        return text
+    parts = [_named_code(one) for one in (value if isinstance(value, list) else [value])]
+    return "|".join(part for part in parts if part) if all(part is not None for part in parts) else text
+
+
+def _named_code(value: Any) -> str | None:
+    """Return the code that a value of JSON is or holds, "" for none, and None when it says something else."""
+    if isinstance(value, dict):
+        plain = {re.sub(r"[\W_]+", "", name.lower()): one for name, one in value.items()}
+        names = [name for name in NAMES["code"].split() if isinstance(plain.get(name), str | int | float)]
+        if not names:
+            return None
+        numbers = (plain.get(name) for name in (*NAMES["value"].split(), "value") if name != names[0])
+        number = next((str(one) for one in numbers if one is not None), "")
+        code = str(plain[names[0]])
+        return f"{code}[{number}]" if _PLAIN_NUMBER.fullmatch(number) and "[" not in code else code
+    return None if isinstance(value, list | bool) else "" if value is None else str(value)
+
+
 def is_osm(column: str, codes: Iterable[str | None], country: str | None) -> bool:
     """Tell whether codes are values of OpenStreetMap's `traffic_sign`: by the column, or by country prefixes."""
     known = [code for code in codes if code]
@@ -87,7 +126,8 @@ def guess_country(codes: Iterable[str | None], here: set[str]) -> str | None:
     codes
         Codes, None where there is none.
     here
-        Countries that the positions may lie in; one of them is preferred to one elsewhere.
+        Countries that the positions may lie in; one of them is preferred to one elsewhere, which must know more of
+        more codes: `R1-1` alone, in Munich, is nobody's.
     """
     counted = Counter(part for code in codes if code for part in split_stack(code, None))
     if not counted:
@@ -101,7 +141,8 @@ def guess_country(codes: Iterable[str | None], here: set[str]) -> str | None:
     words = sum(n for code, n in counted.items() if taxonomy.meaning(code).known) / counted.total()
     able = {country: share for country, share in shares.items() if share >= max(_ENOUGH, words + 0.01)}
     near = {country: share for country, share in able.items() if country in here}
-    return max(near or able, key=lambda country: (near or able)[country], default=None)
+    far = {country: share for country, share in able.items() if share >= _FAR_SHARE and len(counted) >= _FAR_CODES}
+    return max(near or far, key=lambda country: (near or far)[country], default=None)
 
 
 def split_stack(code: str, separator: str | None) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from dataclasses import dataclass, fields
@@ -71,16 +72,19 @@ class InventoryColumns:
 
 
 # What people call these columns, most telling first; compared in lower case, letters and digits only
-_NAMES = {
+NAMES = {
     "code": "rawcode trafficsigncode trafficsign signcode code osmtrafficsign objectvalue mutcdcode mutcd bordkode "
-    "bordcode rvvcode verkehrszeichen vznummer vznr vz zeichen codepanneau panneau merkkikoodi signtype signclass "
+    "bordcode rvvcode devicetypecode tyyppi verkehrszeichen "
+    "vznummer vznr vz zeichen codepanneau panneau merkkikoodi signtype signclass "
     "sign signs schild zeichennummer stvo value class type",
-    "value": "signvalue textonsign opschrift speedlimit maxspeed extratext",
+    "value": "signvalue textonsign opschrift speedlimit maxspeed extratext blackcode arvo",
     "sign_id": "signid id osmid objectid gid fid uuid ogcfid featureid",
-    "facing": "facingdeg facing direction azimuth bearing orientation compassangle kijkrichting richtung heading",
+    "facing": "facingdeg facing direction azimuth bearing orientation compassangle kijkrichting richtung heading "
+    "suuntima",
     "country": "country countrycode isocountry",
-    "x": "lon longitude lng long längengrad laengengrad länge x easting xcoord coordx locatiex pointx rechtswert",
-    "y": "lat latitude breitengrad breite y northing ycoord coordy locatiey pointy hochwert",
+    "x": "lon longitude lng long wgs84lon längengrad laengengrad länge x easting xcoord coordx locatiex pointx "
+    "rechtswert",
+    "y": "lat latitude wgs84lat breitengrad breite y northing ycoord coordy locatiey pointy hochwert",
     "geometry": "wkt geom geometry thegeom wktgeom shape",
     "lat_lon": "latlon latlng latlong lonlat lnglat longlat latitudelongitude coordinates coordinate coords "
     "koordinaten geopoint geopoint2d gps gpscoordinates gpsposition position location",
@@ -170,7 +174,7 @@ def choose_columns(
         found = asked | guessed
         if thing == "lat_lon" and (found.get("geometry") or (found.get("x") and found.get("y"))):
             continue
-        wanted = [*_NAMES[thing].split(), *_cut_names(_NAMES[thing].split(), plain)]
+        wanted = [*NAMES[thing].split(), *_cut_names(NAMES[thing].split(), plain)]
         free = (plain[name] for name in wanted if name in plain and plain[name] not in taken)
         name = next(free, "")
         if name:
@@ -202,6 +206,8 @@ def texts(table: pa.Table, name: str) -> list[str | None]:
         return [None if v is None or v != v else _plain(v) for v in column.to_pylist()]  # noqa: PLR0124  (NaN)
     if pa.types.is_list(column.type) and pa.types.is_string(column.type.value_type):
         column = pc.binary_join(column.cast(pa.list_(pa.string())), "|")  # the plates of a stack
+    elif pa.types.is_nested(column.type):
+        return [None if v is None else json.dumps(v, ensure_ascii=False, default=str) for v in column.to_pylist()]
     try:
         column = pc.utf8_trim_whitespace(column.cast(pa.string()))
         return list(column.to_pylist())

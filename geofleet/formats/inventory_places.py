@@ -30,6 +30,8 @@ _POINT, _MULTIPOINT = 0, 4  # shapely.get_type_id
 _LINES = (1, 2, 5)
 _SRID, _HEX = re.compile(r"SRID=(\d{1,6});\s*", re.IGNORECASE), re.compile(r"0[01][0-9a-fA-F]{8,}\Z")
 
+_WKT = re.compile(r"(?:SRID=\d{1,6};\s*)?(?:MULTI)?(?:POINT|LINESTRING|POLYGON)\b", re.IGNORECASE)
+
 
 @dataclass(frozen=True, slots=True)
 class Places:
@@ -115,11 +117,12 @@ def place_features(
 def _written(features: Features, chosen: InventoryColumns, skipped: Counter[str]) -> NDArray[np.object_] | None:
     """Return the geometries that a column of text holds, None without such a column.
 
-    They are well-known text or bytes in hexadecimal digits, either with an SRID as PostGIS writes them, or GeoJSON.
+    It is the column of geometries, or that of pairs where it holds well-known text. Geometries are well-known text or
+    bytes in hexadecimal digits, either with an SRID as PostGIS writes them, or GeoJSON.
     """
-    if not chosen.geometry:
+    text = texts(features.table, chosen.geometry or chosen.lat_lon)
+    if not (chosen.geometry or any(_WKT.match(one) for one in text if one)):
         return None
-    text = texts(features.table, chosen.geometry)
     shapes = np.full(len(text), None, object)
     for row, written in enumerate(text):
         if written:

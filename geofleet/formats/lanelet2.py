@@ -36,7 +36,7 @@ FORMAT = "lanelet2"
 _MARKINGS = ("stop_line", "zebra_marking")
 _TYPES = (SIGN, "traffic_light", *_MARKINGS)
 _NO_CODE = "unknown"  # what the vocabulary calls a plate of which nobody says what it shows
-_COUNTRY = re.compile(r"([a-z]{2})(?=[A-Z]*\d)")
+_COUNTRY = re.compile(r"([a-z]{2}(?=_?[A-Z]*\d)|[A-Za-z]{2}(?=:[A-Z]*\d))")
 _GROUND_RANGE_M = 30.0
 _NOT_SIGNS = frozenset({"traffic_light", "right_of_way"})  # elements whose bare lines are no plates
 

@@ -7,6 +7,7 @@ import gzip
 import json
 import re
 import zlib
+from collections import Counter
 from typing import IO, TYPE_CHECKING, Any, cast
 
 from geofleet.errors import InputError
@@ -60,9 +61,11 @@ def write_elements(answer: Iterable[Mapping[str, Any]], writer: osmium.SimpleWri
     """
     from osmium.osm.mutable import Node, Way  # noqa: PLC0415  (libosmium is not needed for PBF)
 
-    unnamed = 0
+    unnamed = n_placed = 0
+    without: Counter[str] = Counter()
     for element in answer:
         kind, number, tags = element.get("type"), element.get("id"), element.get("tags") or {}
+        without[_bare(element)] += 1
         if kind not in {"node", "way"}:
             continue
         if not isinstance(number, int) or not isinstance(tags, dict):
@@ -70,6 +73,7 @@ def write_elements(answer: Iterable[Mapping[str, Any]], writer: osmium.SimpleWri
         text = {str(key): str(value) for key, value in tags.items()}
         if kind == "node":
             writer.add_node(Node(id=number, location=_place(element), tags=text))
+            n_placed += 1
             continue
         geometry = element.get("geometry") or []
         refs = element.get("nodes") or range(unnamed - 1, unnamed - 1 - len(geometry), -1)
@@ -78,7 +82,36 @@ def write_elements(answer: Iterable[Mapping[str, Any]], writer: osmium.SimpleWri
         for ref, point in zip(refs, geometry, strict=False):
             if point:
                 writer.add_node(Node(id=ref, location=_place(point)))
+                n_placed += 1
         writer.add_way(Way(id=number, nodes=list(refs), tags=text))
+    if not n_placed:
+        _refuse_bare(without, where)
+
+
+def _bare(element: Mapping[str, Any]) -> str:
+    """Return what an element is given by in place of its points, "" when it has some or is a node."""
+    if element.get("type") == "count":
+        return "count"
+    if element.get("type") == "node" or element.get("geometry"):
+        return ""
+    return next((name for name in ("center", "bounds") if element.get(name)), "ids" if element.get("nodes") else "")
+
+
+def _refuse_bare(without: Counter[str], where: str) -> None:
+    """Refuse an answer that holds no node and no point of a way."""
+    what = {
+        "center": "ways or relations by their centres (`out center`)",
+        "bounds": "ways or relations by their bounds (`out bb`)",
+        "ids": "ways by the ids of their nodes",
+        "count": "counts",
+    }
+    named = [f"{without[kind]} {text}" for kind, text in what.items() if without[kind]]
+    if named:
+        raise InputError(
+            f"the answer holds {' and '.join(named)} only, and no node: signs are mapped as nodes.",
+            where=where,
+            todo="Ask for the nodes with their positions, and for ways with `out geom`: node[traffic_sign](…);out;",
+        )
 
 
 def elements(path: Path) -> Iterator[Mapping[str, Any]]:

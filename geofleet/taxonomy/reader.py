@@ -34,8 +34,15 @@ _FEET = re.compile(
 )  # 12'6"
 _INCHES = 12.0
 _USUAL = {"mph": "km/h", "ft": "m", "st": "t", "mi": "m"}  # a class names any other unit behind its number
-_LANELET2 = re.compile(r"([a-z]{2})([A-Z]*\d.*)")
+_LANELET2 = re.compile(r"([a-z]{2}_?|[A-Za-z]{2}:)([A-Z]*\d.*)")
 _REGION = re.compile(r"(?:[A-Z]{2,3}:\s*|§\s*)(?=\S)")  # a state or province, or the sign of a paragraph
+# How inventories write the numbers of two codes of law: Zeichen 274-50, VZ 206; § 52 Z 10a, §52-10a
+_WRITTEN = {
+    "DE": (re.compile(r"^(?:VZ|Z|Zeichen|Verkehrszeichen|Zusatzzeichen|Nr)\.?\s*[:-]?\s*(?=\d)", re.IGNORECASE), ""),
+    "AT": (re.compile(r"(?<=\d)\s*(?:[/-]|\bZ\.?|\blit\.?|\s)\s*(?=\d)", re.IGNORECASE), "."),
+}
+# What Mapillary finds beside signs
+_OBJECTS = {"object": "other", "construction": "other", "marking": "marking"}
 _MAPILLARY_VARIANT = re.compile(r"--g\d+$")
 
 
@@ -141,8 +148,9 @@ class Taxonomy:
         return np.array([self.concepts[c].group if c in self.concepts else OTHER_GROUP for c in concepts], dtype=object)
 
     def kind_of(self, concepts: Sequence[str]) -> NDArray[np.object_]:
-        """Return the kind of each concept; raw and unknown concepts are `main`."""
-        return np.array([self.concepts[c].kind if c in self.concepts else "main" for c in concepts], dtype=object)
+        """Return the kind of each concept; raw and unknown concepts are `main`, but for objects of Mapillary."""
+        kinds = [self.concepts[c].kind if c in self.concepts else _kind_of_raw(c) for c in concepts]
+        return np.array(kinds, dtype=object)
 
 
 @cache
@@ -161,15 +169,15 @@ def load_taxonomy() -> Taxonomy:
 
 @lru_cache(maxsize=65536)
 def _meaning(code: str, country: str, scheme: str) -> Meaning:
-    text, land = _normalised(code.strip(), country.upper(), scheme)
-    candidates = tuple(dict.fromkeys((text, _without_bracket(text))))
+    texts, land = _normalised(code.strip(), country.upper(), scheme)
+    candidates = tuple(dict.fromkeys(form for text in texts for form in (text, _without_bracket(text))))
     for rule in _rules_for(land, scheme).that_may_match(candidates):
         for candidate in candidates:
             match = rule.pattern.fullmatch(candidate)
             if match:
-                return _understood(rule, match, text)
+                return _understood(rule, match, texts[0])
     raw = RAW_PREFIX + code.strip()
-    return Meaning(raw, OTHER_GROUP, "main", None, None, raw, known=False)
+    return Meaning(raw, OTHER_GROUP, _kind_of_raw(raw), None, None, raw, known=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,14 +235,27 @@ def _rules_of(country: str, scheme: str) -> tuple[_Rule, ...]:
     return (*national, *words)
 
 
-def _normalised(code: str, country: str, scheme: str) -> tuple[str, str]:
+def _kind_of_raw(concept: str) -> str:
+    """Return the kind of what the vocabulary does not know: a sign, or what Mapillary calls an object or a marking."""
+    before, dashes, _ = concept.removeprefix(RAW_PREFIX).partition("--")
+    return _OBJECTS.get(before, "main") if dashes else "main"
+
+
+def _normalised(code: str, country: str, scheme: str) -> tuple[tuple[str, ...], str]:
+    """Return the forms of a code to look for, the likeliest first, and the country whose it is."""
     if scheme == "mapillary":
-        return _MAPILLARY_VARIANT.sub("", code), country
+        return (_MAPILLARY_VARIANT.sub("", code),), country
     match = _LANELET2.fullmatch(code) if scheme == "lanelet2" else None
     if match:
-        return match[2].replace("_", "."), match[1].upper()
+        # de274_1 is 274.1, frB14_50 is B14-50
+        forms = (match[2].replace("_", "."), match[2].replace("_", "-"))
+        return tuple(dict.fromkeys(forms)), match[1][:2].upper()
     region = _REGION.match(code) if country and not scheme else None
-    return (code[region.end() :] if region else code), country
+    text = code[region.end() :] if region else code
+    if not scheme and country in _WRITTEN:
+        pattern, sign = _WRITTEN[country]
+        text = pattern.sub(sign, text, count=1)
+    return (text,), country
 
 
 def _without_bracket(code: str) -> str:
