@@ -43,5 +43,6 @@ def write_geojson(frame: GeoDataFrame, path: Path, *, decimals: int = _DECIMALS)
                 "COORDINATE_PRECISION": str(decimals),
                 "SIGNIFICANT_FIGURES": "17",  # of other numbers: a double needs as many
                 "WRITE_NAME": "YES",
+                "AUTODETECT_JSON_STRINGS": "NO",  # a text like [50] stays one
             },
         )

@@ -22,6 +22,7 @@ OSM, MAPILLARY = "osm", "mapillary"
 NO_CODE = "unknown"  # what the vocabulary calls a plate of which nobody says what it shows
 _STACK = re.compile(r"\s*[|;]\s*|\s+\+\s+")
 _COUNTRY_PREFIX = re.compile(r"[A-Z]{2}:")
+_NAMES_COUNTRY = re.compile(r"\s*[A-Za-z]{2}:\s*[^\s,;|]")
 _PLAIN_NUMBER = re.compile(r"\d+(?:[.,]\d+)?(?:\s*(?:km/h|mph|t|m|%))?")
 _ARRAY = re.compile(r"\{([^{}:]*)\}|\[([^\[\]{}:\"]*)\]")  # of PostgreSQL; a list of Python
 _FAR_SHARE, _FAR_CODES = 0.8, 5  # of codes of a scheme that is not the one of the place
@@ -124,12 +125,13 @@ def guess_country(codes: Iterable[str | None], here: set[str]) -> str | None:
     Parameters
     ----------
     codes
-        Codes, None where there is none.
+        Codes, None where there is none; those that name their country say nothing of the others.
     here
         Countries that the positions may lie in; one of them is preferred to one elsewhere, which must know more of
         more codes: `R1-1` alone, in Munich, is nobody's.
     """
-    counted = Counter(part for code in codes if code for part in split_stack(code, None))
+    bare = (code for code in codes if code and not _NAMES_COUNTRY.match(code))
+    counted = Counter(part for code in bare for part in split_stack(code, None))
     if not counted:
         return None
     taxonomy = load_taxonomy()
@@ -159,10 +161,15 @@ def read_codes(
     scheme: str,
     separator: str | None,
 ) -> Plates:
-    """Return the plates of codes of one scheme, or of each code's country."""
+    """Return the plates of codes of one scheme, or of each code's country.
+
+    Without a scheme, a code that names its country (`DE:274[30],1040`) is a value of OpenStreetMap.
+    """
 
     @cache
     def plates(code: str, value: str, country: str | None) -> tuple[Plate, ...]:
+        if not scheme and not separator and _NAMES_COUNTRY.match(code):
+            return _osm_plates({"traffic_sign": code}, country)
         parts = split_stack(code, separator) or [""]
         meanings = [_meaning(part, value if len(parts) == 1 else "", country or "", scheme) for part in parts]
         kinds = [meaning.kind for meaning in meanings]
@@ -180,14 +187,18 @@ def read_osm(tags: Iterable[dict[str, str]], country: str | None) -> Plates:
 
     @cache
     def plates(items: tuple[tuple[str, str], ...]) -> tuple[Plate, ...]:
-        return tuple(
-            Plate(sign.raw_code, sign.country or country, sign.meaning, sign.kind, sign.parent, sign.facing_deg)
-            for sign in node_signs(dict(items))
-        )
+        return _osm_plates(dict(items), country)
 
     found = [plates(tuple(sorted(one.items()))) for one in tags]
     others = sum(not one for one in found)
     return Plates(found, {"other objects, without a sign": others} if others else {})
+
+
+def _osm_plates(tags: dict[str, str], country: str | None) -> tuple[Plate, ...]:
+    return tuple(
+        Plate(sign.raw_code, sign.country or country, sign.meaning, sign.kind, sign.parent, sign.facing_deg)
+        for sign in node_signs(tags)
+    )
 
 
 def _meaning(code: str, value: str, country: str, scheme: str) -> Meaning:

@@ -43,6 +43,7 @@ _WRITTEN = {
 }
 # What Mapillary finds beside signs
 _OBJECTS = {"object": "other", "construction": "other", "marking": "marking"}
+_NAMED = re.compile(r"([A-Za-z]{2}):\s*(\S.*)")  # a code that names its country, as OpenStreetMap has them
 _MAPILLARY_VARIANT = re.compile(r"--g\d+$")
 
 
@@ -140,7 +141,10 @@ class Taxonomy:
         )
 
     def meaning(self, code: str, *, country: str = "", scheme: str = "") -> Meaning:
-        """Return what one code means; an unknown one is its own concept, `raw:<code>`, of kind `main`."""
+        """Return what one code means; an unknown one is its own concept, `raw:<code>`, of kind `main`.
+
+        A code that names another country (`US:R1-1`) is looked up there when it means nothing in the one given.
+        """
         return _meaning(code, country, scheme)
 
     def group_of(self, concepts: Sequence[str]) -> NDArray[np.object_]:
@@ -176,6 +180,11 @@ def _meaning(code: str, country: str, scheme: str) -> Meaning:
             match = rule.pattern.fullmatch(candidate)
             if match:
                 return _understood(rule, match, texts[0])
+    named = _NAMED.fullmatch(code.strip()) if scheme in {"", "lanelet2"} else None
+    if named and named[1].upper() != country.upper():
+        theirs = _meaning(named[2], named[1], "")
+        if theirs.known:
+            return theirs
     raw = RAW_PREFIX + code.strip()
     return Meaning(raw, OTHER_GROUP, _kind_of_raw(raw), None, None, raw, known=False)
 

@@ -27,12 +27,13 @@ from geofleet.workflows.convert import convert
 SUFFIXES = (".parquet", ".geojson", ".gpkg", ".fgb", ".osm", ".osc")
 PBF = Path(__file__).parents[2] / "data" / "raw" / "helsinki.osm.pbf"
 
-text = st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]) | st.just(" "), min_size=1, max_size=20)
+letters = st.characters(codec="utf-8", exclude_categories=["C", "Z"]) | st.just(" ")
+text = st.text(letters, min_size=1, max_size=20) | st.sampled_from(["[50]", "{}", '"', "1e5", "null", "-0"])
 degrees = st.floats(0, 360, exclude_max=True)
 times = st.datetimes(datetime(1990, 1, 1), datetime(2100, 1, 1), timezones=st.just(UTC))  # noqa: DTZ001 (UTC is put on)
-classes = st.sampled_from(
-    [(c.name, c.kind, c.unit) for c in load_taxonomy().concepts.values()] + [("raw:X 1", "main", "")]
-)
+known = st.sampled_from([(c.name, c.kind, c.unit) for c in load_taxonomy().concepts.values()])
+in_other_units = st.sampled_from([("speed_limit", "main", "mph"), ("height_limit", "main", "ft")])
+classes = known | in_other_units | st.builds(lambda code: (f"raw:{code}", "main", ""), text)
 
 
 @st.composite
@@ -40,7 +41,10 @@ def sign_tables(draw):
     n = draw(st.integers(1, 4))
     rows = [draw(st.tuples(classes, st.none() | st.integers(1, 200), text)) for _ in range(n)]
     values = [None if value is None or not c[2] else float(value) for c, value, _ in rows]
-    named = [c[0] if v is None else f"{c[0]}:{v:g}" for (c, _, _), v in zip(rows, values, strict=True)]
+    named = [
+        c[0] if v is None else f"{c[0]}:{v:g}{c[2] if c[2] in {'mph', 'ft'} else ''}"
+        for (c, _, _), v in zip(rows, values, strict=True)
+    ]
     each = {
         "parent_id": st.none() | text,
         "country": st.sampled_from([None, "DE", "FI"]),
@@ -153,11 +157,14 @@ def test_what_openstreetmap_cannot_hold_is_told_and_nothing_is_written(code, mak
     assert [path.name for path in tmp_path.iterdir()] == ["in.parquet"]
 
 
-def test_a_gis_layer_keeps_the_code_of_a_vehicle_in_any_script(make_signs, tmp_path):
-    write_table(SIGNS, make_signs([(0, 0)], ["stop"], raw_code=["とまれ <&>\"'"]), tmp_path / "in.parquet")
+@pytest.mark.parametrize(
+    "code", ["とまれ <&>\"'", "[50]", "{}", '{"a": 1}', "null", "1e5", "2024-05-01", "a;b|c,d", "-0"]
+)
+def test_a_layer_keeps_a_code_in_any_script_and_form(code, make_signs, tmp_path):
+    write_table(SIGNS, make_signs([(0, 0)], ["stop"], raw_code=[code]), tmp_path / "in.parquet")
     for suffix in SUFFIXES:
         convert(tmp_path / "in.parquet", tmp_path / f"out{suffix}")
-        assert read_layer(tmp_path / f"out{suffix}").table["raw_code"].to_pylist() == ["とまれ <&>\"'"]
+        assert read_layer(tmp_path / f"out{suffix}").table["raw_code"].to_pylist() == [code], suffix
 
 
 @pytest.mark.parametrize("suffix", [".geojson", ".gpkg", ".fgb"])
