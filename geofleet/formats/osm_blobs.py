@@ -20,7 +20,7 @@ MAX_BLOB_BYTES = 32 * 1024 * 1024
 _MAX_HEADER_BYTES = 64 * 1024
 _MAX_LZMA_BYTES = 1 << 28
 _READ = frozenset({"OsmSchema-V0.6", "DenseNodes"})
-_ZLIB, _LZMA, _ARROW = 3, 4, {6: "lz4_raw", 7: "zstd"}  # field numbers of a blob
+_RAW, _ZLIB, _LZMA, _ARROW = 1, 3, 4, {6: "lz4_raw", 7: "zstd"}  # field numbers of a blob
 _PEEK_BYTES = 32
 
 
@@ -61,23 +61,37 @@ def _blob_header(header: bytes) -> tuple[bytes, int]:
     return kind, size
 
 
-def unpack(blob: bytes, *, nodes_only: bool = False) -> bytes:
+def unpack(blob: bytes) -> bytes:
     """Return the content of a blob, of at most 32 MiB as the format has it, whatever it would grow to."""
+    content, raw_size, how = _packed(blob)
+    if how == _RAW:
+        return bytes(content)
+    return _inflated(content, raw_size) if how == _ZLIB else _unpacked(content, raw_size, how)
+
+
+def is_without_nodes(blob: bytes) -> bool:
+    """Tell whether a blob is one group of ways or relations; may say no of such a one, never yes of another.
+
+    Its first bytes tell, and what follows its strings: less is unpacked than of the whole.
+    """
+    content, raw_size, how = _packed(blob)
+    return how == _ZLIB and _begins_without_nodes(content, raw_size)
+
+
+def _packed(blob: bytes) -> tuple[memoryview, int, int]:
+    """Return what a blob holds, how large that is when unpacked, and in which way it is packed."""
     packed: Span | None = None
     raw_size = how = 0
     for number, value in fields(blob, (0, len(blob))):
         if number == 1 and isinstance(value, tuple):
-            return blob[slice(*value)]
+            return memoryview(blob)[slice(*value)], value[1] - value[0], _RAW
         if number == 2 and isinstance(value, int):  # noqa: PLR2004 - field numbers are the format's
             raw_size = value
         elif isinstance(value, tuple):
             packed, how = value, number
     if packed is None or not 0 <= raw_size <= MAX_BLOB_BYTES:
         raise DamagedPbfError(f"a block that would unpack to {raw_size} bytes")
-    content = memoryview(blob)[slice(*packed)]
-    if how == _ZLIB:
-        return b"" if nodes_only and _is_without_nodes(content, raw_size) else _inflated(content, raw_size)
-    return _unpacked(content, raw_size, how)
+    return memoryview(blob)[slice(*packed)], raw_size, how
 
 
 def _unpacked(packed: memoryview, raw_size: int, how: int) -> bytes:
@@ -106,8 +120,7 @@ def _inflated(packed: memoryview, raw_size: int) -> bytes:
     return content
 
 
-def _is_without_nodes(packed: memoryview, raw_size: int) -> bool:
-    """Tell whether a block is one group of ways or relations, by its first bytes and what follows its strings."""
+def _begins_without_nodes(packed: memoryview, raw_size: int) -> bool:
     unpacker = zlib.decompressobj()
     head = unpacker.decompress(packed, _PEEK_BYTES)
     if head[:1] != b"\x0a":

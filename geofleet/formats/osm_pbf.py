@@ -1,8 +1,8 @@
-"""OpenStreetMap's PBF, read a block at a time: https://wiki.openstreetmap.org/wiki/PBF_Format.
+"""OpenStreetMap's PBF, read some blocks at a time: https://wiki.openstreetmap.org/wiki/PBF_Format.
 
-Blocks are unpacked and decoded on threads of their own, as arrays, numbers of a block at once. Blocks that cannot hold
-what is looked for are passed over by a search in their string table, so that a file is read about as fast as it
-unpacks, and memory holds a few blocks whatever its size.
+Blocks are unpacked and decoded on threads of their own, as arrays, numbers of several blocks at once. Blocks that
+cannot hold what is looked for are passed over by a search in their string table, and memory holds a few blocks whatever
+the size of the file.
 
 Read are dense nodes and ways, which is what every usual writer makes. Anything else that the format allows raises
 `UnusualPbfError`; libosmium can rewrite such a file.
@@ -17,110 +17,27 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
-
 from geofleet.errors import InputError
-from geofleet.formats.osm_blobs import UnusualPbfError, check_features, read_blobs, unpack
-from geofleet.formats.protobuf import BYTES, VARINT, DamagedPbfError, deltas, fields, signed, varint, varints
+from geofleet.formats.osm_blobs import UnusualPbfError, check_features, is_without_nodes, read_blobs, unpack
+from geofleet.formats.osm_strings import Strings
+from geofleet.formats.protobuf import BYTES, VARINT, DamagedPbfError, fields, signed, varint
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
     from concurrent.futures import Future
     from pathlib import Path
-
-    from numpy.typing import NDArray
+    from typing import BinaryIO
 
     from geofleet.formats.protobuf import Span
 
-    Ints = NDArray[np.int64]
+__all__ = ["Block", "UnusualPbfError", "read_blocks"]
 
-__all__ = ["Block", "DenseNodes", "Strings", "UnusualPbfError", "read_blocks"]
-
-_THREADS, _AHEAD = 2, 6
-_NANO_PER_E7 = 100
-_NEWLINE = 0x0A  # field 1, bytes
-_HEAD = 3  # bytes by which strings are looked up
+_THREADS, _AHEAD = 2, 4
+_BYTES_AT_ONCE = 384 << 10  # packed: some four blocks as libosmium makes them
+_LARGE_BYTES = 16 << 20
 _WAY_FIELDS = ((1, 0), (2, b""), (3, b""), (8, b""))  # id, keys, values, refs
 
 _T = TypeVar("_T")
-
-
-@dataclass(frozen=True, slots=True)
-class DenseNodes:
-    """Nodes of a group: ids and positions in 1e-7 degrees, shape (n,), and their tags as the block has them.
-
-    `keys_vals` holds numbers of strings, key and value in turn, with a 0 after each node; empty when no node has tags.
-    """
-
-    node_id: Ints
-    lon_e7: Ints
-    lat_e7: Ints
-    keys_vals: Ints
-
-
-@dataclass(frozen=True, slots=True)
-class Strings:
-    """A string table: where each string begins and ends; strings are cut when asked for."""
-
-    data: bytes
-    begin: Ints
-    end: Ints
-
-    @classmethod
-    def of(cls, data: bytes, span: Span) -> Strings:
-        """Find the strings of a table.
-
-        Each begins with a newline, as the format happens to have it, and says how long it is. So all newlines are
-        taken for beginnings, and where one is not, since it stands inside of a string, those up to the string's end go.
-        """
-        begin, end = span
-        if begin == end:
-            return cls(data, np.zeros(0, np.int64), np.zeros(0, np.int64))
-        raw = np.frombuffer(data, np.uint8)
-        at = np.append(np.flatnonzero(raw[begin:end] == _NEWLINE) + begin, end)
-        first, second = (raw[np.minimum(at + n, len(raw) - 1)].astype(np.int64) for n in (1, 2))
-        is_long = first >= 0x80  # noqa: PLR2004 - the top bit says that more bytes follow
-        ends = at + 2 + np.where(is_long, 1 + (first & 0x7F) + (second << 7), first)
-        ends[is_long & (second >= 0x80)] = -1  # noqa: PLR2004 - as above
-        kept = np.ones(len(at), bool)
-        odd = np.flatnonzero(ends[:-1] != at[1:])
-        after = np.searchsorted(at, np.minimum(ends[odd], end))
-        is_wrong = at[after] != ends[odd]
-        beyond = 0
-        for place, follows, wrong in zip(odd.tolist(), after.tolist(), is_wrong.tolist(), strict=True):
-            if place >= beyond:
-                if wrong:
-                    raise DamagedPbfError("a string table with something else in it")
-                kept[place + 1 : follows] = False
-                beyond = follows
-        if at[0] != begin:
-            raise DamagedPbfError("a string table with something else in it")
-        kept[-1] = False
-        return cls(data, (at + 2 + is_long)[kept], ends[kept])
-
-    def __len__(self) -> int:
-        return len(self.begin)
-
-    def __getitem__(self, index: int) -> bytes:
-        return self.data[self.begin[index] : self.end[index]]
-
-    def take(self, numbers: Ints) -> list[bytes]:
-        """Return the strings of some numbers."""
-        places = zip(self.begin[numbers].tolist(), self.end[numbers].tolist(), strict=True)
-        return [self.data[at:end] for at, end in places]
-
-    def numbers(self, texts: Iterable[bytes]) -> list[int]:
-        """Return the numbers of the strings that are one of some texts, of three bytes or more."""
-        wanted = set(texts)
-        return [n for n in self.starting(wanted) if self[n] in wanted]
-
-    def starting(self, heads: Iterable[bytes]) -> list[int]:
-        """Return the numbers of the strings whose first three bytes are those of one of some texts."""
-        raw = np.frombuffer(self.data, np.uint8)
-        at = np.minimum(self.begin, len(raw) - _HEAD)
-        first, second, third = (raw[at + n].astype(np.uint32) for n in range(_HEAD))
-        wanted = {int.from_bytes(head[:_HEAD], "big") for head in heads}
-        return np.flatnonzero(np.isin(first << 16 | second << 8 | third, list(wanted))).tolist()
 
 
 @dataclass(frozen=True)
@@ -147,27 +64,35 @@ class Block:
         start, end = self._parts[0]
         return self.data.find(text, start, end) >= 0
 
+    @property
+    def string_table(self) -> bytes:
+        """The string table as the file has it."""
+        return self.data[slice(*self._parts[0])]
+
     @cached_property
     def strings(self) -> Strings:
-        """The string table."""
-        return Strings.of(self.data, self._parts[0])
+        """The strings."""
+        return Strings.of([self.string_table])
 
-    def dense_nodes(self, *, tagged: bool = True) -> Iterator[DenseNodes]:
-        """Yield the nodes of each group; without tags when they are not asked for.
+    def number(self, field: int) -> int:
+        """Return granularity (17), latitude's (19) or longitude's offset (20)."""
+        return self._parts[2][field]
+
+    def dense_groups(self) -> Iterator[dict[int, bytes]]:
+        """Yield the columns of the nodes of each group, by field.
 
         Raises
         ------
         UnusualPbfError
             Nodes are not stored densely.
         """
-        _, groups, numbers = self._parts
-        for group in groups:
+        for group in self._parts[1]:
             # A group holds things of one kind, and dense nodes are one field.
             number, value = next(fields(self.data, group), (0, 0))
             if number == 1:
                 raise UnusualPbfError("nodes that are not dense")
             if number == 2 and isinstance(value, tuple):  # noqa: PLR2004 - field numbers are the format's
-                yield self._dense(value, numbers, tagged=tagged)
+                yield {n: self.data[slice(*at)] for n, at in fields(self.data, value) if isinstance(at, tuple)}
 
     def has_nodes(self) -> bool:
         """Tell whether the block holds nodes, without decoding them."""
@@ -205,23 +130,13 @@ class Block:
             raise DamagedPbfError("a way without its fields")
         return signed(way_id), keys, values, refs
 
-    def _dense(self, span: Span, numbers: dict[int, int], *, tagged: bool) -> DenseNodes:
-        packed = {1: b"", 8: b"", 9: b"", 10: b""}
-        for number, value in fields(self.data, span):
-            if isinstance(value, tuple):
-                packed[number] = self.data[slice(*value)]
-        node_id, lat, lon = (deltas(packed[number]) for number in (1, 8, 9))
-        if not len(node_id) == len(lat) == len(lon):
-            raise DamagedPbfError("ids and positions differ in number")
-        lat_e7, lon_e7 = (_e7(numbers[offset], numbers[17], side) for offset, side in ((19, lat), (20, lon)))
-        return DenseNodes(node_id, lon_e7, lat_e7, varints(packed[10]) if tagged else np.zeros(0, np.int64))
 
+def read_blocks(path: Path, work: Callable[[list[Block]], _T], *, nodes_only: bool = False) -> Iterator[_T]:
+    """Yield what `work` makes of the blocks of a file, some at a time, in the order of the file.
 
-def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = False) -> Iterator[_T]:
-    """Yield what `work` makes of every block of a file, in the order of the file.
-
-    `work` runs on threads, beside what the caller does with what it made: most of both is zlib's and numpy's, which let
-    others run. Blocks of ways and relations come without their content with `nodes_only`, which spares unpacking it.
+    `work` runs on threads, beside what the caller does with what it made: most of both lets others run. With
+    `nodes_only`, blocks of ways and relations come without their content, which spares unpacking it, once one has come:
+    in most files all nodes stand first.
 
     Raises
     ------
@@ -231,24 +146,26 @@ def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = F
         The file is valid and not read here.
     """
 
-    def made(blob: bytes) -> _T:
-        return work(Block(unpack(blob, nodes_only=nodes_only)))
+    def made(blobs: list[bytes], *, is_past: bool) -> tuple[bool, _T]:
+        blocks = [Block(b"" if is_past and is_without_nodes(blob) else unpack(blob)) for blob in blobs]
+        return nodes_only and not blocks[-1].has_nodes(), work(blocks)
 
+    # glibc gives memory back at every turn, and has it zeroed anew for the next block, until a large piece was freed.
+    bytes(_LARGE_BYTES)
     with path.open("rb") as file, ThreadPoolExecutor(_THREADS) as pool:
-        waiting: deque[tuple[int, Future[_T]]] = deque()
+        waiting: deque[tuple[int, Future[tuple[bool, _T]]]] = deque()
         at = 0
+        is_past = False
         try:
-            for begin, kind, blob in read_blobs(file):
-                if kind == b"OSMHeader":
-                    check_features(unpack(blob))
-                elif kind == b"OSMData":
-                    waiting.append((begin, pool.submit(made, blob)))
+            for begin, blobs in _some_at_once(file):
+                waiting.append((begin, pool.submit(made, blobs, is_past=is_past)))
                 if len(waiting) >= _AHEAD:
                     at, done = waiting.popleft()
-                    yield done.result()
+                    is_past, result = done.result()
+                    yield result
             while waiting:
                 at, done = waiting.popleft()
-                yield done.result()
+                yield done.result()[1]
         except (DamagedPbfError, zlib.error, IndexError, OverflowError) as error:
             raise InputError(
                 f"damaged, or not an OpenStreetMap file ({error}, at or after byte {at}).",
@@ -260,9 +177,19 @@ def read_blocks(path: Path, work: Callable[[Block], _T], *, nodes_only: bool = F
                 done.cancel()
 
 
-def _e7(offset: int, granularity: int, coded: Ints) -> Ints:
-    """Return degrees as a block has them in 1e-7, rounded towards zero as libosmium does: every tool reads the same."""
-    if offset % _NANO_PER_E7 == 0 and granularity % _NANO_PER_E7 == 0:
-        return offset // _NANO_PER_E7 + granularity // _NANO_PER_E7 * coded
-    nano = offset + granularity * coded
-    return np.where(nano < 0, -(-nano // _NANO_PER_E7), nano // _NANO_PER_E7)
+def _some_at_once(file: BinaryIO) -> Iterator[tuple[int, list[bytes]]]:
+    """Yield the place of the first of some blobs of data, and those."""
+    some: list[bytes] = []
+    first = n_bytes = 0
+    for begin, kind, blob in read_blobs(file):
+        if kind == b"OSMHeader":
+            check_features(unpack(blob))
+        elif kind == b"OSMData":
+            first = first if some else begin
+            some.append(blob)
+            n_bytes += len(blob)
+            if n_bytes >= _BYTES_AT_ONCE:
+                yield first, some
+                some, n_bytes = [], 0
+    if some:
+        yield first, some

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from geofleet.formats.osm_dense import DenseNodes
 from geofleet.formats.osm_pbf import Block, read_blocks
 from geofleet.formats.osm_roads import Roads
 from geofleet.formats.osm_tags import CAR_ROADS, ROAD_KEYS, is_drivable, oneway_of, speed_kmh
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from geofleet.formats.osm_pbf import Strings
+    from geofleet.formats.osm_strings import Strings
 
     Ints = NDArray[np.int64]
 
@@ -37,14 +38,15 @@ def read_roads(pbf: Path) -> Roads:
     InputError
         The file is damaged.
     """
-    ways = _Ways.joined([found for found in map(_ways_in, read_blocks(pbf, lambda block: block)) if found])
+    ways = _Ways.joined(
+        [found for some in read_blocks(pbf, lambda blocks: blocks) for found in map(_ways_in, some) if found]
+    )
     way_of = np.repeat(np.arange(len(ways.way_id)), ways.n_refs)
     wanted = np.unique(ways.refs)
     index = np.searchsorted(wanted, ways.refs).astype(np.int32)
     place = np.full((len(wanted), 2), _NOWHERE, np.int32)
-    for found in read_blocks(pbf, lambda block: _nodes_in(block, wanted), nodes_only=True):
-        for rows, lon, lat in found:
-            place[rows, 0], place[rows, 1] = lon, lat
+    for rows, lon, lat in read_blocks(pbf, lambda blocks: _nodes_in(blocks, wanted), nodes_only=True):
+        place[rows, 0], place[rows, 1] = lon, lat
     there = np.asarray((np.abs(place) <= _MAX_E7).all(axis=1), bool)
     is_there = there[index]
     kept, first, sizes = _runs(np.flatnonzero(is_there), way_of[is_there])
@@ -146,15 +148,13 @@ def _summed(coded: Ints, start: Ints) -> Ints:
     return np.asarray(total[1:] - np.repeat(total[start[:-1]], np.diff(start)), np.int64)
 
 
-def _nodes_in(block: Block, wanted: Ints) -> list[tuple[Ints, Ints, Ints]]:
-    """Return index among the wanted ids, longitude and latitude of the nodes of a block that are wanted."""
-    found = []
-    for nodes in block.dense_nodes(tagged=False):
-        index = np.searchsorted(wanted, nodes.node_id)
-        hit = np.flatnonzero(wanted[np.minimum(index, len(wanted) - 1)] == nodes.node_id) if len(wanted) else index[:0]
-        lon, lat = (np.clip(side[hit], -_NOWHERE, _NOWHERE) for side in (nodes.lon_e7, nodes.lat_e7))
-        found.append((index[hit], lon, lat))
-    return found
+def _nodes_in(blocks: list[Block], wanted: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return index among the wanted ids, longitude and latitude of the nodes of some blocks that are wanted."""
+    nodes = DenseNodes(blocks)
+    index = np.searchsorted(wanted, nodes.node_id)
+    hit = np.flatnonzero(wanted[np.minimum(index, len(wanted) - 1)] == nodes.node_id) if len(wanted) else index[:0]
+    lon, lat = (np.clip(side, -_NOWHERE, _NOWHERE) for side in nodes.lonlat_e7(hit))
+    return index[hit], lon, lat
 
 
 def _encoded(number: int) -> bytes:

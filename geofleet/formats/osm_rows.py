@@ -181,7 +181,7 @@ class SignRows:
         }
         if index is not None:
             columns |= self._beside(index.roads, index.nearest(lon, lat), node, template)
-        return build_table(SIGNS, columns, (lon[node], lat[node]))
+        return build_table(SIGNS, columns, (lon[node], lat[node]), in_order=True)
 
     def _beside(self, roads: Roads, near: NearestRoad, node: Ints, template: Ints) -> dict[str, Any]:
         """Return road and facing of each row, and count them."""

@@ -10,6 +10,7 @@ import re
 import tempfile
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -18,7 +19,8 @@ import numpy as np
 from geofleet.errors import InputError
 from geofleet.formats import osm_json
 from geofleet.formats.osm_copy import copy_as_pbf
-from geofleet.formats.osm_pbf import Block, DenseNodes, Strings, UnusualPbfError, read_blocks
+from geofleet.formats.osm_dense import DenseNodes
+from geofleet.formats.osm_pbf import UnusualPbfError, read_blocks
 from geofleet.formats.osm_spool import NODE, NodeSpool
 from geofleet.formats.osm_tags import (
     KEY_STARTS,
@@ -33,6 +35,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from geofleet.formats.osm_pbf import Block
+    from geofleet.formats.osm_strings import Strings
+
     Ints = NDArray[np.int64]
 
 _T = TypeVar("_T")
@@ -42,6 +47,8 @@ _LANELET = re.compile(rb"""v=["']lanelet["']""")
 _CHUNK, _OVERLAP = 1 << 20, 64
 _TAG_BYTES = 16  # two numbers
 _STARTS = [word.encode() for word in (*KEY_STARTS, *POINT_HIGHWAYS)]
+_HIGHWAY = b"highway"
+_POINT_WORDS = frozenset(word.encode() for word in POINT_HIGHWAYS)
 # What a block with signs has in its string table: a key, or a word of `highway` with its length before it.
 _WORDS = tuple(b"\n%c" % len(word) + word.encode() for word in POINT_HIGHWAYS)
 _MARKS = (b"traffic_sign", *_WORDS)
@@ -65,11 +72,9 @@ class SignNodes:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """Sign nodes of a group: id, position, tags as numbers of strings, (m, 2), and which strings those are."""
+    """Sign nodes of some blocks: how many tags each has, those as numbers of strings, (m, 2), and which these are."""
 
-    node_id: Ints
-    lon_e7: Ints
-    lat_e7: Ints
+    nodes: NDArray[np.void]
     n_tags: Ints
     tags: Ints
     used: Ints
@@ -177,13 +182,11 @@ def sign_nodes(pbf: Path) -> SignNodes:
     tagsets: dict[bytes, int] = {}
     spool = NodeSpool()
     has_nodes = False
-    for block in read_blocks(pbf, _decoded, nodes_only=True):
-        has_nodes |= block is not None
-        for found in _signs_in(*block) if block else ():
-            nodes = np.empty(len(found.node_id), NODE)
-            nodes["node_id"], nodes["tagset"] = found.node_id, _numbered(found, known, tagsets)
-            nodes["lon_e7"], nodes["lat_e7"] = _int32(found.lon_e7), _int32(found.lat_e7)
-            spool.append(nodes)
+    for found in read_blocks(pbf, _signs_in, nodes_only=True):
+        has_nodes |= found is not None
+        if found:
+            found.nodes["tagset"] = _numbered(found, known, tagsets)
+            spool.append(found.nodes)
     if not has_nodes:
         raise InputError("the file holds no nodes.", where=str(pbf), todo="Check that it is the extract you mean.")
     return SignNodes(spool, [_tags(packed, list(known)) for packed in tagsets])
@@ -212,59 +215,51 @@ def _int32(e7: Ints) -> NDArray[np.int32]:
     return np.clip(e7, -limit, limit).astype(np.int32)
 
 
-def _decoded(block: Block) -> tuple[Strings, list[DenseNodes]] | tuple[()] | None:
-    """Return the strings and nodes of a block, nothing where none has signs; None when it holds no nodes at all."""
-    if not block.has_nodes():
+def _signs_in(blocks: list[Block]) -> _Found | None:
+    """Return the sign nodes of some blocks; None when they hold no nodes at all."""
+    if not any(block.has_nodes() for block in blocks):
         return None
-    if not any(map(block.holds_string, _MARKS)):
-        return ()
-    return block.strings, list(block.dense_nodes())
+    nodes = DenseNodes([block for block in blocks if any(map(block.holds_string, _MARKS))], tagged=True)
+    chosen, n_tags, tags = _sign_tags(nodes)
+    found = np.empty(len(chosen), NODE)
+    if len(chosen):
+        found["node_id"] = nodes.node_id[chosen]
+        found["lon_e7"], found["lat_e7"] = map(_int32, nodes.lonlat_e7(chosen))
+    used = np.flatnonzero(np.bincount(tags.ravel()))
+    return _Found(found, n_tags, tags, used, nodes.strings.take(used))
 
 
-def _signs_in(strings: Strings, groups: list[DenseNodes]) -> Iterator[_Found]:
-    """Yield the sign nodes of each group of a block."""
-    key_role, is_word, highway = _roles(strings)
-    for nodes in groups:
-        if len(nodes.keys_vals):
-            chosen, counts, tags = _sign_tags(nodes, key_role, is_word, highway)
-            used = np.flatnonzero(np.bincount(tags.ravel()))
-            place = (nodes.node_id[chosen], nodes.lon_e7[chosen], nodes.lat_e7[chosen])
-            yield _Found(*place, counts, tags, used, strings.take(used))
-
-
-def _roles(strings: Strings) -> tuple[NDArray[np.int8], NDArray[np.bool_], int]:
-    """Tell which strings are keys that tell of signs (1) or name them (2), which are signs' words, which is highway."""
-    role = np.zeros(len(strings), np.int8)
-    is_word = np.zeros(len(strings), bool)
-    highway = -1
-    for index in strings.starting(_STARTS):
-        text = strings[index].decode(errors="replace")
-        if index and text.startswith(KEY_STARTS):
-            role[index] = 2 if is_sign_key(text) else tells_of_signs(text)
-        is_word[index] = text in POINT_HIGHWAYS
-        if text == "highway" and highway < 0:
-            highway = index
-    return role, is_word, highway
-
-
-def _sign_tags(
-    nodes: DenseNodes, key_role: NDArray[np.int8], is_word: NDArray[np.bool_], highway: int
-) -> tuple[Ints, Ints, Ints]:
+def _sign_tags(nodes: DenseNodes) -> tuple[Ints, Ints, Ints]:
     """Return which nodes carry signs, how many tags of theirs tell of them, and those: numbers of strings, (m, 2)."""
-    coded = nodes.keys_vals
-    ends = np.flatnonzero(coded == 0)
-    if len(ends) != len(nodes.node_id) or ends[-1] != len(coded) - 1:
-        raise ValueError("tags and nodes differ in number")
+    key_role, is_word, is_highway = _roles(nodes.strings)
+    coded, ends = nodes.tags()
     at = np.flatnonzero((key_role > 0)[coded])
     owner = np.searchsorted(ends, at)
     start = np.where(owner > 0, ends[owner - 1] + 1, 0)
     is_key = (at - start) % 2 == 0
     at, owner = at[is_key], owner[is_key]
     key, value = coded[at], coded[at + 1]
-    names = (key_role[key] == 2) | ((key == highway) & is_word[value])  # noqa: PLR2004 - the role of sign keys
-    carries = np.zeros(len(nodes.node_id), bool)
+    names = (key_role[key] == 2) | (is_highway[key] & is_word[value])  # noqa: PLR2004 - the role of sign keys
+    carries = np.zeros(len(ends), bool)
     carries[owner[names]] = True
     kept = carries[owner]
     chosen = np.flatnonzero(carries)
     counts = np.bincount(owner[kept], minlength=len(carries))[chosen]
     return chosen, counts, np.column_stack((key[kept], value[kept]))
+
+
+def _roles(strings: Strings) -> tuple[NDArray[np.int8], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Tell which strings are keys that tell of signs (1) or name them (2), which are signs' words, which highway."""
+    role = np.zeros(len(strings), np.int8)
+    is_word, is_highway = np.zeros((2, len(strings)), bool)
+    for index in strings.starting(_STARTS):
+        text = strings[index]
+        role[index], is_word[index], is_highway[index] = _role(text), text in _POINT_WORDS, text == _HIGHWAY
+    role[strings.first[:-1]] = 0  # none of a tag
+    return role, is_word, is_highway
+
+
+@lru_cache(maxsize=4096)
+def _role(key: bytes) -> int:
+    text = key.decode(errors="replace")
+    return (2 if is_sign_key(text) else tells_of_signs(text)) if text.startswith(KEY_STARTS) else 0

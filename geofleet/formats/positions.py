@@ -56,9 +56,11 @@ class PlaceCheck:
             return
         sea = (np.abs(lon) < _EMPTY_SEA_DEG) & (np.abs(lat) < _EMPTY_SEA_DEG)
         column, row = (np.floor(side / _CELL_DEG).astype(np.int64) for side in (lon, lat))
-        cells, in_cell = np.unique((column << _ROW_BITS) + row + _ROW_OFFSET, return_counts=True)
-        x = ((cells >> _ROW_BITS) + 0.5) * _CELL_DEG
-        y = ((cells & ((1 << _ROW_BITS) - 1)) - _ROW_OFFSET + 0.5) * _CELL_DEG
+        every = np.sort((column << _ROW_BITS) + row + _ROW_OFFSET)  # np.unique imports numpy.ma
+        first = np.flatnonzero(np.diff(every, prepend=every[0] - 1))
+        cells, in_cell = every[first], np.diff(first, append=len(every))
+        x = np.asarray((cells >> _ROW_BITS) + 0.5, np.float64) * _CELL_DEG
+        y = np.asarray((cells & ((1 << _ROW_BITS) - 1)) - _ROW_OFFSET + 0.5, np.float64) * _CELL_DEG
         self._n["all"] += len(lon)
         self._n["guinea"] += int(sea.sum())
         self._n["no land"] += int(in_cell[~_is_on_land(x, y)].sum())

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -29,14 +29,38 @@ class DamagedPbfError(ValueError):
 
 def varints(packed: bytes) -> Ints:
     """Decode packed unsigned numbers, as 64 bits whose sign is the reader's affair."""
-    raw = np.frombuffer(packed, np.uint8)
-    if not len(raw):
-        return np.zeros(0, np.int64)
+    return _decoded(np.frombuffer(packed, np.uint8))[0]
+
+
+def varints_of(parts: Sequence[bytes]) -> tuple[Ints, Ints]:
+    """Decode many packed sequences at once; return their numbers and where each begins, with the total last."""
+    numbers, last = _decoded(np.frombuffer(b"".join(parts), np.uint8))
+    ends = np.cumsum([0, *map(len, parts)])
+    start = np.searchsorted(last, ends)
+    filled = np.diff(ends) > 0
+    if (last[start[1:][filled] - 1] != ends[1:][filled] - 1).any():
+        raise DamagedPbfError("a number that does not end")
+    return numbers, start
+
+
+def deltas_of(parts: Sequence[bytes]) -> tuple[Ints, Ints]:
+    """Decode packed, zigzag-coded differences to the numbers themselves, each sequence from zero; else `varints_of`."""
+    coded, start = varints_of(parts)
+    half = (coded.view(np.uint64) >> np.uint64(1)).view(np.int64)
+    total = np.cumsum(half ^ -(coded & 1))
+    inner = start[1:-1][start[1:-1] > 0]
+    for first, last, before in zip(inner.tolist(), [*inner[1:].tolist(), len(total)], total[inner - 1], strict=False):
+        total[first:last] -= before
+    return total, start
+
+
+def _decoded(raw: NDArray[np.uint8]) -> tuple[Ints, Ints]:
+    """Return packed numbers, and where the last byte of each is."""
     ends = np.flatnonzero(raw < 0x80)  # noqa: PLR2004 - the top bit says that more bytes follow
-    if not len(ends) or ends[-1] != len(raw) - 1:
+    if len(raw) and (not len(ends) or ends[-1] != len(raw) - 1):
         raise DamagedPbfError("a number that does not end")
     if len(ends) == len(raw):
-        return raw.astype(np.int64)
+        return raw.astype(np.int64), ends
     starts = np.concatenate(([0], ends[:-1] + 1))
     n_more = ends - starts
     most = int(n_more.max())
@@ -46,7 +70,7 @@ def varints(packed: bytes) -> Ints:
     if most >= _SHORT_BYTES:
         rows = np.flatnonzero(n_more >= _SHORT_BYTES)
         value[rows] = _long(raw, starts[rows], n_more[rows])
-    return value
+    return value, ends
 
 
 def _short(raw: NDArray[np.uint8], starts: Ints, most: int) -> Ints:
@@ -66,24 +90,6 @@ def _long(raw: NDArray[np.uint8], starts: Ints, n_more: Ints) -> Ints:
     bits[place > n_more[:, None]] = 0
     joined: Ints = np.bitwise_or.reduce(bits << (7 * place).astype(np.uint64), axis=1).view(np.int64)
     return joined
-
-
-def varints_of(parts: list[bytes]) -> tuple[Ints, Ints]:
-    """Decode many packed sequences at once; return their numbers and where each begins, with the total last."""
-    joined = b"".join(parts)
-    numbers = varints(joined)
-    ends = np.cumsum([0, *map(len, parts)])
-    is_last = np.frombuffer(joined, np.uint8) < 0x80  # noqa: PLR2004 - the top bit says that more bytes follow
-    if not is_last[ends[1:][np.diff(ends) > 0] - 1].all():
-        raise DamagedPbfError("a number that does not end")
-    return numbers, np.concatenate(([0], np.cumsum(is_last)))[ends]
-
-
-def deltas(packed: bytes) -> Ints:
-    """Decode packed, zigzag-coded differences to the numbers themselves."""
-    coded = varints(packed)
-    half = (coded.view(np.uint64) >> np.uint64(1)).view(np.int64)
-    return np.cumsum(half ^ -(coded & 1))
 
 
 def fields(data: bytes, span: Span) -> Iterator[tuple[int, int | Span]]:

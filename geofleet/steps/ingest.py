@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 from geofleet.errors import SUSPICIOUS, ConfigError, InputError
 from geofleet.formats import layers
 from geofleet.formats.reading import LayerStream
-from geofleet.tables.manifest import write_manifest
+from geofleet.tables.manifest import Hashing, write_manifest
 from geofleet.tables.schemas import BBOX, DRIVES, LANES, SIGNS
 from geofleet.tables.store import lonlat, sort_by_key, write_pieces
 
@@ -221,6 +221,7 @@ def _ingest(
     found: Counter[str] = Counter()
     kinds: Counter[str] = Counter()
     layers_read = []
+    hashing = Hashing(path for path, *_ in plan)
     for done, (path, _, reader) in enumerate(plan):
         if progress:
             progress(done, len(plan))
@@ -235,7 +236,7 @@ def _ingest(
     write_manifest(
         Path(out),
         step=f"ingest {schema.name}",
-        inputs=[path for path, *_ in plan],
+        inputs=hashing,
         settings=settings,
         counts={"rows": n_rows, "by_kind": by_kind, "found": dict(found), "skipped": dict(skipped)},
     )

@@ -64,6 +64,8 @@ def build_table(
     schema: Schema,
     columns: Mapping[str, Any],
     geometry: tuple[Floats, Floats] | Sequence[Any] | NDArray[Any] | None = None,
+    *,
+    in_order: bool = False,
 ) -> pa.Table:
     """Make a table of a schema from columns.
 
@@ -76,6 +78,8 @@ def build_table(
         Optional columns are in the table when they are given.
     geometry
         Longitudes and latitudes of points in degrees, or shapely geometries (None where the schema allows it).
+    in_order
+        The rows are in the order of the schema's key, and nobody will change the arrays: they are taken as they are.
 
     Raises
     ------
@@ -95,7 +99,8 @@ def build_table(
         arrays.append(_column(schema, field, columns.get(field.name), n_rows))
     if schema.geometry:
         arrays.extend(_encode(schema, geometry, n_rows))
-    return sort_by_key(schema, pa.Table.from_arrays(arrays, schema=arrow))
+    table = pa.Table.from_arrays(arrays, schema=arrow)
+    return table if in_order else sort_by_key(schema, table)
 
 
 def sort_by_key(schema: Schema, table: pa.Table) -> pa.Table:

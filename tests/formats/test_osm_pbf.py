@@ -4,6 +4,7 @@ import bz2
 import lzma
 import random
 import zlib
+from itertools import pairwise
 
 import numpy as np
 import osmium
@@ -15,12 +16,14 @@ from osmium.osm import NODE, WAY
 from osmium.osm.mutable import Node, Way
 
 from geofleet.errors import InputError
+from geofleet.formats import osm_pbf
 from geofleet.formats.osm import read_lanes, read_signs
-from geofleet.formats.osm_pbf import Strings, UnusualPbfError, read_blocks
+from geofleet.formats.osm_pbf import UnusualPbfError, read_blocks
 from geofleet.formats.osm_road_scan import read_roads
 from geofleet.formats.osm_scan import sign_nodes
+from geofleet.formats.osm_strings import Strings
 from geofleet.formats.osm_tags import POINT_HIGHWAYS, is_drivable, is_sign_key
-from geofleet.formats.protobuf import deltas, varints
+from geofleet.formats.protobuf import DamagedPbfError, deltas_of, varints
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 
@@ -93,20 +96,34 @@ def test_numbers_are_decoded(numbers):
     assert varints(b"".join(map(packed, numbers))).view(np.uint64).tolist() == numbers
 
 
-@given(st.lists(st.integers(-(2**40), 2**40)))
-def test_differences_are_summed(numbers):
-    steps = [b - a for a, b in zip([0, *numbers], numbers, strict=False)]
-    assert deltas(b"".join(map(zigzag, steps))).tolist() == numbers
+@given(st.lists(st.lists(st.integers(-(2**40), 2**40)), max_size=4))
+def test_differences_of_several_sequences_are_summed_each_for_itself(sequences):
+    parts = [b"".join(zigzag(b - a) for a, b in zip([0, *numbers], numbers, strict=False)) for numbers in sequences]
+    numbers, start = deltas_of(parts)
+    assert [numbers[a:b].tolist() for a, b in pairwise(start)] == sequences
+    for wrong in ([*parts, b"\x80", b"\x00"], [*parts, b"\x80"]):
+        with pytest.raises(DamagedPbfError, match="does not end"):
+            deltas_of(wrong)
 
 
-@given(st.lists(st.binary(max_size=300), max_size=20))
+@given(st.lists(st.lists(st.binary(max_size=300), max_size=20), max_size=4))
 def test_strings_are_found_wherever_their_bytes_repeat(texts):
-    table = b"".join(field(1, text) for text in texts)
-    strings = Strings.of(table, (0, len(table)))
-    assert [strings[n] for n in range(len(strings))] == texts
-    for text in texts:
+    tables = [b"".join(field(1, text) for text in some) for some in texts]
+    strings = Strings.of(tables)
+    assert strings.first.tolist() == np.cumsum([0, *map(len, texts)]).tolist()
+    flat = [text for some in texts for text in some]
+    assert [strings[n] for n in range(len(strings))] == flat
+    for text in flat:
         if len(text) >= 3:
-            assert [n for n, other in enumerate(texts) if other == text] == strings.numbers([text])
+            assert [n for n, other in enumerate(flat) if other == text] == strings.numbers([text])
+
+
+@pytest.mark.parametrize(
+    "tables", [[b"\n\x05ab", b"\n\x01c"], [b"\n\x01a", b"x"], [b"\n\x01a\n\x03b"], [b"ab", b"\n\x00"]]
+)
+def test_a_string_that_ends_beyond_its_table_is_refused(tables):
+    with pytest.raises(DamagedPbfError, match="string table"):
+        Strings.of(tables)
 
 
 def all_of(nodes):
@@ -153,6 +170,37 @@ def test_ways_may_come_before_their_nodes_and_in_one_block_with_them(tmp_path):
         assert roads.way_id.tolist() == [7]
         assert roads.lat.tolist() == [50.0, -50.0]
         assert len(all_of(sign_nodes(path))) == 2
+
+
+def test_ways_are_passed_over_once_some_have_come_and_nodes_after_them_are_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(osm_pbf, "_BYTES_AT_ONCE", 1)
+    ways = block(STRINGS, way_group(*((n, [5, 9], [3, 5]) for n in range(1, 9))))
+    signs = block(STRINGS, SIGN)
+    path = pbf(tmp_path / "a.pbf", signs, *[ways] * 8, signs, *[ways] * 8, signs)
+    sizes = [len(one.data) for some in read_blocks(path, lambda blocks: blocks, nodes_only=True) for one in some]
+    assert [sizes[0], sizes[9], sizes[18]] == [len(signs)] * 3
+    assert sizes[1:9] == [len(ways)] * 4 + [0] * 4
+    assert sorted(set(sizes[10:18])) == [0, len(ways)]
+    assert all_of(sign_nodes(path))["node_id"].tolist() == [5, -3] * 3
+
+
+def test_blocks_decoded_together_give_what_each_gives_alone(tmp_path, monkeypatch):
+    other = [b"", b"highway", b"give_way", b"x", b"traffic_sign", b"DE:101", b""]
+    path = pbf(
+        tmp_path / "a.pbf",
+        block(STRINGS, SIGN, dense([(1, 7, 8, [])]), dense([(2, -7, -8, [1, 6, 3, 5])]), granularity=1000),
+        block([b""], dense([(3, 1, 1, [])])),
+        block(other, dense([(11, 123, 456, [1, 2]), (12, 1, 2, [3, 3]), (13, 3, 4, [4, 5, 1, 3])]), lat_offset=12345),
+        block(STRINGS, way_group((7, [5, 9], [3, 5]))),
+        block(other, dense([(14, 9, 9, [4, 6])]), granularity=7),
+    )
+    together = sign_nodes(path)
+    monkeypatch.setattr(osm_pbf, "_BYTES_AT_ONCE", 1)
+    alone = sign_nodes(path)
+    assert all_of(together).tolist() == all_of(alone).tolist()
+    assert all_of(together)["node_id"].tolist() == [5, -3, 2, 11, 13, 14]
+    assert together.tagsets == alone.tagsets
+    assert together.tagsets[-1] == {"traffic_sign": ""}
 
 
 def plain_nodes(*nodes):
@@ -310,5 +358,5 @@ def test_many_blocks_stay_in_order_and_share_their_tags(tmp_path):
     assert len(list(layer.pieces())) > 1
     assert ids == sorted(ids)
     assert len(ids) == 26_667
-    assert len(list(read_blocks(path, lambda one: one.has_nodes()))) > 5
+    assert sum(map(len, read_blocks(path, lambda blocks: blocks))) > 5
     assert read_roads(path).lon.tolist() == [1e-4, 4.0]
