@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
+
+_LOCALE = re.compile(r"[a-z]{2}[-_]([A-Z]{2})")
 
 # ISO 3166-1: alpha-2 followed by alpha-3
 _CODES = """
@@ -83,8 +86,13 @@ _NAMES = {
 
 
 def country_code(text: str) -> str | None:
-    """Return the ISO 3166-1 alpha-2 code of a country given by alpha-2, alpha-3 or name in any case; None otherwise."""
-    return _known().get(text.strip().casefold())
+    """Return the ISO 3166-1 alpha-2 code of a country given by alpha-2, alpha-3 or name in any case; None otherwise.
+
+    Of a language and its country, as in `de-DE`, that is the country.
+    """
+    name = text.strip()
+    locale = _LOCALE.fullmatch(name)
+    return _known().get((locale[1] if locale else name).casefold())
 
 
 @cache

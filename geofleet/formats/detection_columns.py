@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from geofleet.errors import ConfigError
 from geofleet.formats.drive_times import guess_format, times_of
-from geofleet.formats.inventory_columns import numbers, read_options
+from geofleet.formats.inventory_columns import numbers, parse_numbers, read_options
 from geofleet.tables.arrays import sound_times
 from geofleet.tables.schemas import TIME
 
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 NAMES = {
     "sign_class": "signclass",
     "raw_code": "rawcode code trafficsigncode trafficsign signcode mutcdcode mutcd classname label value objectvalue "
-    "class signtype type",
+    "class signtype zeichen verkehrszeichen vz type",
     "country": "country countrycode",
-    "x": "lon longitude lng long x easting",
-    "y": "lat latitude y northing",
+    "x": "lon longitude lng long länge laenge längengrad laengengrad x easting",
+    "y": "lat latitude breite breitengrad y northing",
     "geometry": "wkt geometry geom",
     "run_id": "runid",
-    "vehicle_id": "vehicleid vehicle carid car deviceid",
+    "vehicle_id": "vehicleid vehicle carid car deviceid fahrzeug",
     "pass_id": "passid pass tripid trip driveid sequenceid",
     "track_id": "trackid track",
-    "t_first": "tfirst firstseenat firstseen timestamp tutc time datetime",
+    "t_first": "tfirst firstseenat firstseen timestamp timestampms tutc time datetime ts zeit zeitstempel t",
     "t_last": "tlast lastseenat lastseen",
     "frame_first": "framefirst",
     "frame_last": "framelast",
@@ -48,7 +48,7 @@ NAMES = {
     "cov_en_m2": "covenm2",
     "range_mean_m": "rangemeanm range",
     "view_deg": "viewdeg viewdirection",
-    "class_confidence": "classconfidence confidence score probability",
+    "class_confidence": "classconfidence confidence score probability konfidenz",
 }
 FLOATS = ("sigma_e_m", "sigma_n_m", "cov_en_m2", "range_mean_m", "view_deg", "class_confidence")
 INTEGERS = ("frame_first", "frame_last", "n_frames")
@@ -139,6 +139,18 @@ def number_column(table: pa.Table, name: str | None) -> Floats:
     """Return a column as numbers, NaN where it holds none."""
     values = numbers(table, name or "")
     return np.where(np.isfinite(values), values, np.nan)
+
+
+def share_column(table: pa.Table, name: str | None) -> tuple[Floats, int]:
+    """Return a column as numbers, `90%` as 0.9, and how many texts are neither."""
+    values = number_column(table, name)
+    if not name or not np.isnan(values).any() or pa.types.is_floating(table.schema.field(name).type):
+        return values, 0
+    text = text_column(table, name)
+    share = pc.if_else(pc.ends_with(text, "%"), pc.utf8_rtrim(text, "% "), None)
+    parsed = parse_numbers(share.to_pylist()) / 100.0
+    values = np.where(np.isnan(values), parsed, values)
+    return values, int((pc.is_valid(text).to_numpy(zero_copy_only=False) & np.isnan(values)).sum())
 
 
 def integer_column(table: pa.Table, name: str | None) -> tuple[pa.Array, int]:

@@ -27,13 +27,14 @@ from geofleet.formats.detection_columns import (
     given_columns,
     integer_column,
     leave_out_impossible,
-    number_column,
     number_of_track,
+    share_column,
     text_column,
     time_column,
 )
 from geofleet.formats.detection_files import read_batches
 from geofleet.formats.inventory_codes import OSM, guess_country, scheme_of
+from geofleet.formats.inventory_columns import coordinates
 from geofleet.formats.inventory_places import geometry_reader
 from geofleet.formats.positions import country_at, doubts, reject_null_island, to_lonlat
 from geofleet.formats.reading import WGS84
@@ -59,6 +60,7 @@ REJECTED = pa.schema([("reason", pa.string()), ("source", pa.string()), ("row", 
 _CRS84 = "OGC:CRS84"
 _MAX_LAT_DEG = 85.05  # beyond it no tile owns a sign
 _POINT = 0
+_TRACK_AGAIN = "rows of a track that came before: one row a track is meant, aggregation takes the first"
 _PREFIXED = re.compile(r"[A-Z]{2}:")
 
 
@@ -137,6 +139,7 @@ def read_detections(
             found.update({f"{thing} read from column {chosen[thing]} (guessed)": 1 for thing in guessed})
             plan = _Plan(chosen, crs or batch.crs or _CRS84, scheme or "", country, run_id, rows_before)
             plan = _settled(plan, batch, path, found)
+            found[_TRACK_AGAIN] += _n_again(batch, plan)
         yield _read(batch, plan, path, found)
     if plan is None:
         raise InputError("the file holds no rows.", where=str(path), todo="Fetch or export it again.")
@@ -176,6 +179,14 @@ def _settled(plan: _Plan, batch: Batch, path: Path, found: Counter[str]) -> _Pla
     return replace(plan, scheme=scheme, country=country)
 
 
+def _n_again(batch: Batch, plan: _Plan) -> int:
+    """Return how many of the first rows are of a track that came before: frames, where tracks are meant."""
+    if not {"pass_id", "track_id"} <= plan.columns.keys():
+        return 0
+    keys = pa.table(_keys(batch.table, plan, np.arange(batch.table.num_rows)))
+    return int(keys.num_rows - keys.group_by(keys.column_names).aggregate([]).num_rows)
+
+
 def _read(batch: Batch, plan: _Plan, path: Path, found: Counter[str]) -> DetectionsRead:
     """Return the rows of a batch as a table, and those that are none."""
     table, chosen = batch.table, plan.columns
@@ -187,7 +198,9 @@ def _read(batch: Batch, plan: _Plan, path: Path, found: Counter[str]) -> Detecti
     columns: dict[str, Any] = {"sign_class": classes, "raw_code": raw, "country": country}
     columns |= _keys(table, plan, row)
     for name in FLOATS:
-        columns[name] = pa.array(number_column(table, chosen.get(name)), from_pandas=True)
+        values, n_bad = share_column(table, chosen.get(name))
+        columns[name] = pa.array(values, from_pandas=True)
+        found[f"{name} that cannot be read, left out"] += n_bad
     for reader, names in ((integer_column, INTEGERS), (time_column, TIMES)):
         for name in names:
             columns[name], n_bad = reader(table, chosen.get(name))
@@ -213,7 +226,7 @@ def _coordinates(batch: Batch, plan: _Plan) -> tuple[Floats, Floats]:
     chosen = plan.columns
     shapes = batch.geometry
     if "x" in chosen and "y" in chosen:
-        return number_column(batch.table, chosen["x"]), number_column(batch.table, chosen["y"])
+        return _degrees(batch.table, chosen["x"]), _degrees(batch.table, chosen["y"])
     if shapes is None:
         column = text_column(batch.table, chosen.get("geometry"))
         first = next(iter(column.drop_null().slice(0, 1).to_pylist()), "")
@@ -223,6 +236,12 @@ def _coordinates(batch: Batch, plan: _Plan) -> tuple[Floats, Floats]:
     places = np.full(len(shapes), None, object)
     places[is_place] = shapes[is_place]
     return shapely.get_x(places), shapely.get_y(places)
+
+
+def _degrees(table: pa.Table, name: str) -> Floats:
+    """Return a column as numbers; of texts that are none, degrees with minutes, seconds or a hemisphere."""
+    values = coordinates(table, name)
+    return np.where(np.isfinite(values), values, np.nan)
 
 
 def _places(batch: Batch, plan: _Plan, path: Path) -> tuple[Floats, Floats]:

@@ -46,6 +46,33 @@ _KNOWN = (
         "a log of a NovAtel receiver",
         "Log or convert it to NMEA: GPGGA and GPRMC; or export it as CSV with week, tow, lat, lon.",
     ),
+    _foreign(
+        rb"(?:HDR [^\n]*\n)*DIR FRAME ",
+        "a solution of CSRS-PPP",
+        "Write date and time (GPS time, 18 s ahead of UTC), latitude and longitude as CSV.",
+    ),
+    _foreign(
+        rb"\$(?:POS|VELACC|CLK|ION|TROP|SAT),",
+        "the statistics of an RTKLIB solution (.pos.stat)",
+        "Give the .pos beside it.",
+    ),
+    _foreign(rb"LASF|#? ?\.PCD|ply\r?\n", "a cloud of points", "Give the signs or the drive themselves."),
+    _foreign(
+        rb"[^<]*<.*<net\s[^>]*(?:version|junctionCornerDetail)=",
+        "a network of SUMO",
+        "It holds no signs; `netconvert -s {name} --opendrive-output map.xodr` makes OpenDRIVE of its roads.",
+    ),
+    _foreign(
+        rb"[^<]*<.*<commonRoad\s",
+        "a CommonRoad scenario",
+        "Convert its map to Lanelet2 with the CommonRoad Scenario Designer (crdesigner).",
+    ),
+    _foreign(rb"[^<]*<.*<OpenSCENARIO", "an OpenSCENARIO scenario", "Give the .xodr that its LogicFile names."),
+    _foreign(
+        rb"[^<]*<.*<(?:\w+:)?CityModel[\s>]",
+        "a CityGML model",
+        "Convert its traffic signs to GeoJSON with ogr2ogr of GDAL.",
+    ),
     _foreign(rb"\$@..", "a log of a Septentrio receiver (SBF)", "Convert it to NMEA: GGA and RMC."),
     _foreign(rb" {0,8}\d\.\d\d {10,}(?:OBSERVATION|NAVIGATION|O |N )", "raw observations (RINEX)", _SOLVE),
     _foreign(rb"\xd3[\0-\3]", "raw observations (RTCM 3)", _SOLVE),

@@ -41,6 +41,10 @@ _WRITTEN = {
     "DE": (re.compile(r"^(?:VZ|Z|Zeichen|Verkehrszeichen|Zusatzzeichen|Nr)\.?\s*[:-]?\s*(?=\d)", re.IGNORECASE), ""),
     "AT": (re.compile(r"(?<=\d)\s*(?:[/-]|\bZ\.?|\blit\.?|\s)\s*(?=\d)", re.IGNORECASE), "."),
 }
+_SPEED = re.compile(r"(?:max|speed)[ _-]?(?:speed|limit)[ _:=-]*\(?(\d{1,3})\s*(km/?h|mph)?\)?", re.IGNORECASE)
+_WORDS = re.compile(r"[A-Za-z]{2,}(?:[\s-]+[A-Za-z]+)+(?=\s*(?:[\[(]|\Z))")
+_MILES = frozenset({"US", "GB"})
+_CLASS = re.compile(r"([a-z][a-z_]+)(?::(\d+(?:\.\d+)?)([a-z/]*))?")
 # What Mapillary finds beside signs
 _OBJECTS = {"object": "other", "construction": "other", "marking": "marking"}
 _NAMED = re.compile(r"([A-Za-z]{2}):\s*(\S.*)")  # a code that names its country, as OpenStreetMap has them
@@ -174,17 +178,20 @@ def load_taxonomy() -> Taxonomy:
 @lru_cache(maxsize=65536)
 def _meaning(code: str, country: str, scheme: str) -> Meaning:
     texts, land = _normalised(code.strip(), country.upper(), scheme)
-    candidates = tuple(dict.fromkeys(form for text in texts for form in (text, _without_bracket(text))))
-    for rule in _rules_for(land, scheme).that_may_match(candidates):
-        for candidate in candidates:
+    candidates = {_without_bracket(text): text for text in reversed(texts)} | {text: text for text in texts}
+    for rule in _rules_for(land, scheme).that_may_match(tuple(candidates)):
+        for candidate, text in candidates.items():
             match = rule.pattern.fullmatch(candidate)
             if match:
-                return _understood(rule, match, texts[0])
+                return _understood(rule, match, text)
     named = _NAMED.fullmatch(code.strip()) if scheme in {"", "lanelet2"} else None
     if named and named[1].upper() != country.upper():
         theirs = _meaning(named[2], named[1], "")
         if theirs.known:
             return theirs
+    own = _own_class(code.strip()) if not scheme else None
+    if own:
+        return own
     raw = RAW_PREFIX + code.strip()
     return Meaning(raw, OTHER_GROUP, _kind_of_raw(raw), None, None, raw, known=False)
 
@@ -264,7 +271,30 @@ def _normalised(code: str, country: str, scheme: str) -> tuple[tuple[str, ...], 
     if not scheme and country in _WRITTEN:
         pattern, sign = _WRITTEN[country]
         text = pattern.sub(sign, text, count=1)
-    return (text,), country
+    return ((text,) if scheme else tuple(dict.fromkeys((text, _worded(text, country))))), country
+
+
+def _worded(text: str, country: str) -> str:
+    """Return `No entry` as the word `no_entry`, `Speed limit (50km/h)` or `maxspeed:50` as `speed_limit[50 km/h]`.
+
+    A speed without a unit is in that of the country.
+    """
+    speed = _SPEED.fullmatch(text)
+    if speed:
+        unit = (speed[2] or ("mph" if country in _MILES else "km/h")).lower().replace("kmh", "km/h")
+        return f"speed_limit[{speed[1]} {unit}]"
+    words = _WORDS.match(text)
+    return re.sub(r"[\s-]+", "_", words[0].lower()) + text[words.end() :] if words else text
+
+
+def _own_class(code: str) -> Meaning | None:
+    """Return what a class of geofleet means, `speed_limit:50` or `speed_limit:25mph`; None for anything else."""
+    match = _CLASS.fullmatch(code)
+    concept = load_taxonomy().concepts.get(match[1]) if match else None
+    if match is None or concept is None or (match[2] and not concept.unit):
+        return None
+    value, unit = (float(match[2]), match[3] or concept.unit) if match[2] else (None, None)
+    return Meaning(concept.name, concept.group, concept.kind, value, unit, code, known=True)
 
 
 def _without_bracket(code: str) -> str:

@@ -8,6 +8,7 @@ import pyarrow as pa
 import pytest
 
 from geofleet.errors import InputError
+from geofleet.formats.countries import country_code
 from geofleet.formats.inventory import read_signs
 from geofleet.formats.inventory_codes import guess_country, plain_codes
 from geofleet.formats.inventory_columns import texts
@@ -137,6 +138,35 @@ def test_codes_as_lanelet2_maps_write_them(tmp_path, code, sign_class):
     table = read_lanelet2(path).table
     assert table["sign_class"].to_pylist() == [sign_class]
     assert table["country"].to_pylist() == [None if code == "stop_sign" else code[:2].upper()]
+
+
+@pytest.mark.parametrize(
+    ("text", "country", "sign_class"),
+    [
+        ("Speed limit (50km/h)", "", "speed_limit:50"),
+        ("speed_limit_50", "", "speed_limit:50"),
+        ("maxspeed:50", "DE", "speed_limit:50"),
+        ("Speed limit 35", "US", "speed_limit:35mph"),
+        ("speed limit 30 mph", "", "speed_limit:30mph"),
+        ("No entry", "FR", "no_entry"),
+        ("Give way", "", "yield"),
+        ("Speed limit [30]", "", "speed_limit:30"),
+        ("maxspeed", "", "speed_limit"),
+        ("maxspeed:end", "", "end_speed_limit"),
+        ("speed_limit:60", "", "speed_limit:60"),
+        ("speed_limit:25mph", "US", "speed_limit:25mph"),
+        ("stop:4", "", "raw:stop:4"),
+        ("Zone 30 ahead", "", "raw:Zone 30 ahead"),
+    ],
+)
+def test_words_and_classes_in_a_column_of_codes(text, country, sign_class):
+    meaning = load_taxonomy().meaning(text, country=country)
+    assert meaning.sign_class == sign_class
+    assert meaning.known is not sign_class.startswith("raw:")
+
+
+def test_a_language_with_its_country_names_the_country():
+    assert [country_code(text) for text in ("de-DE", "fr_FR", "DEU", "US-CA")] == ["DE", "FR", "DE", None]
 
 
 def test_what_mapillary_finds_beside_signs_is_no_main_sign():

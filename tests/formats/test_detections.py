@@ -230,3 +230,30 @@ def test_text_of_parquet_that_is_not_utf_8_is_refused(tmp_path):
     pq.write_table(pa.table({"lon": [13.0, 13.1], "lat": [52.0, 52.1], "sign_class": text}), tmp_path / "fleet.parquet")
     with pytest.raises(InputError, match=r"damaged or not parquet.*UTF8"):
         list(read_detections(tmp_path / "fleet.parquet"))
+
+
+def test_detections_as_spreadsheets_and_phones_write_them(tmp_path):
+    path = tmp_path / "fleet.csv"
+    path.write_text(
+        "Fahrzeug;Zeit;Breite;Länge;Zeichen;Konfidenz\n"
+        "v1;Thu Mar 21 14:05:06 GMT+01:00 2024;48°06'00\"N;11°30'00\"E;206;90%\n"
+        "v1;20240321130507;48,1001° N;11,5° E;Zeichen 274-50;0,8\n"
+        "v1;2024-03-21 13:05:08Z;4806.0120N;01130.0000E;205;sure\n",
+        encoding="cp1252",
+    )
+    (read,) = read_detections(path)
+    assert read.table["vehicle_id"].to_pylist() == ["v1"] * 3
+    assert [t.isoformat() for t in read.table["t_first"].to_pylist()] == [
+        f"2024-03-21T13:05:0{s}+00:00" for s in (6, 7, 8)
+    ]
+    np.testing.assert_allclose(lonlat(read.table), ([11.5] * 3, [48.1, 48.1001, 48.1002]))
+    assert read.table["sign_class"].to_pylist() == ["stop", "speed_limit:50", "yield"]
+    assert read.table["class_confidence"].to_pylist() == [0.9, 0.8, None]
+    assert read.found["class_confidence that cannot be read, left out"] == 1
+
+
+def test_frames_in_place_of_tracks_are_told(tmp_path):
+    path = tmp_path / "fleet.csv"
+    path.write_text("pass_id,track_id,frame,lat,lon,class\n" + "".join(f"p,1,{n},48.1,11.5,stop\n" for n in range(5)))
+    (read,) = read_detections(path)
+    assert [n for what, n in read.found.items() if "a track that came before" in what] == [4]

@@ -281,6 +281,16 @@ def test_a_line_without_times_is_a_path(tmp_path):
         ("a.json", b'{"locations":[{"latitudeE7":481,"longitudeE7":115}]}', "location history of Google"),
         ("a.json", b'{"class":"VERSION","release":"3.25"}\n{"class":"TPV"}', "gpsd.*gpspipe"),
         ("a.plt", b"Geolife trajectory\r\nWGS 84\r\n", "Geolife.*lat,lon,zero,altitude,days,date,time"),
+        ("a.pos", b"DIR FRAME        STN         DAYofYEAR YEAR-MM-DD", "CSRS-PPP.*GPS time"),
+        ("a.stat", b"$POS,2306,392724.000,1,4182105.1", "statistics of an RTKLIB solution"),
+        (
+            "a.xml",
+            b"<?xml version='1.0'?>\n<net version='1.9' x='y'><location/>",
+            "network of SUMO.*netconvert -s a.xml",
+        ),
+        ("a.xml", b"<?xml version='1.0'?><commonRoad x='y'>", "CommonRoad.*Lanelet2"),
+        ("a.xosc", b"<?xml version='1.0'?><OpenSCENARIO>", "OpenSCENARIO.*LogicFile"),
+        ("a.gml", b"<?xml version='1.0'?><core:CityModel x='y'>", "CityGML.*ogr2ogr"),
         ("a.mat", b"MATLAB 5.0 MAT-file", "arrays"),
     ],
 )
