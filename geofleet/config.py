@@ -163,6 +163,7 @@ class AggregateConfig(_Section):
     min_support: Annotated[int, Field(ge=1)]
     min_support_share: Rate
     correct_bias: Annotated[bool, Off(value=False)]
+    unknown_classes: Annotated[Literal["keep", "reject"], Off("keep")]
     assumed_gnss_sigma_m: Annotated[Positive, Off(2.0)]
     prior_sigma_m: Annotated[Positive, Off(0.15)]
     tile_zoom: Annotated[int, Field(ge=12, le=20)]

@@ -78,6 +78,19 @@ def parse_utm(text: str | None) -> tuple[str, float, float] | None:
     return crs, east, north
 
 
+def parse_area(text: str | None) -> tuple[float, float, float, float] | None:
+    """Read `W,S,E,N`, degrees."""
+    if text is None:
+        return None
+    try:
+        west, south, east, north = map(float, text.split(","))
+    except ValueError:
+        raise ConfigError(
+            f"{text!r} is not W,S,E,N.", where="--area", todo="Example: --area 24.93,60.16,24.96,60.18"
+        ) from None
+    return west, south, east, north
+
+
 def parse_shift(text: str) -> tuple[float, float]:
     """Read `E,N`, metres."""
     try:

@@ -9,7 +9,18 @@ from typing import Annotated
 
 import typer
 
-from geofleet.cli.options import N_CORES, AsJson, ConfigFile, Out, OutFolder, Scenario, Settings, Workers, settle
+from geofleet.cli.options import (
+    N_CORES,
+    AsJson,
+    ConfigFile,
+    Out,
+    OutFolder,
+    Scenario,
+    Settings,
+    Workers,
+    parse_area,
+    settle,
+)
 from geofleet.cli.output import (
     print_evaluation,
     print_files,
@@ -87,6 +98,7 @@ def aggregate(
     min_support: Annotated[int | None, typer.Option(help="Passes that a sign needs: all but joint.")] = None,
     passes: Annotated[Path | None, typer.Option(help="A passes table: who could have seen a place.")] = None,
     prior: Annotated[Path | None, typer.Option(help="An earlier map, any sign source: joint.")] = None,
+    area: Annotated[str | None, typer.Option(help="Set detections outside aside, degrees.", metavar="W,S,E,N")] = None,
     explain: Annotated[
         str | None, typer.Option(help="Also list what is behind a sign: joint.", metavar="SIGN_ID")
     ] = None,
@@ -130,6 +142,7 @@ def aggregate(
             passes=passes,
             k_from=k_from,
             prior=prior,
+            area=parse_area(area),
             n_workers=workers,
             progress=progress,
         )

@@ -137,7 +137,7 @@ def load_sql(name: str) -> Statement:
         name=name,
         text=text,
         why=" ".join(header["why"]),
-        reads=tuple(word.strip() for word in ",".join(header["reads"]).split(",") if word.strip()),
+        reads=tuple(word.strip() for word in ",".join(header["reads"]).split(",") if word.strip() not in {"", "none"}),
         params=tuple(sorted(declared)),
         writes=_parse_columns(" ".join(header["writes"])),
     )
@@ -209,6 +209,12 @@ def materialise(connection: duckdb.DuckDBPyConnection, name: str, params: Mappin
     text, texts = _bound(name, params or {})
     with _naming(name):
         connection.sql(text, params=texts[0] if texts else None).create(name.rpartition("/")[2])
+
+
+def make_empty(connection: duckdb.DuckDBPyConnection, name: str) -> None:
+    """Make a table with the columns that a statement writes, and no row."""
+    columns = ", ".join(f"{column} {kind}" for column, kind in load_sql(name).writes)
+    connection.execute(f"CREATE TABLE {name.rpartition('/')[2]} ({columns})")
 
 
 def keep_table(connection: duckdb.DuckDBPyConnection, table: pa.Table, name: str) -> None:

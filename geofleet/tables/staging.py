@@ -12,10 +12,11 @@ import pyarrow as pa
 from geofleet.tables.arrays import numpy_numbers
 from geofleet.tables.biases import BiasSummary, correct_passes
 from geofleet.tables.binding import bind_table
-from geofleet.tables.database import create_view, keep_table, load_sql, materialise, run
+from geofleet.tables.database import create_view, keep_table, make_empty, materialise, run
 from geofleet.tables.dealt import Dealer, write_pass_hashes
 from geofleet.tables.plain import BLOCK_ROWS, MAX_ID_BITS, Survey, coded_blocks, survey
 from geofleet.tables.schemas import DETECTIONS
+from geofleet.taxonomy.reader import load_taxonomy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,6 +33,25 @@ MAX_BATCHES = 500  # files that are written by turns
 
 
 @dataclass(frozen=True, slots=True)
+class Limits:
+    """What detections must keep to, beside being sound.
+
+    Parameters
+    ----------
+    area
+        West, south, east and north in degrees; west beyond east is a box across the antimeridian. None for anywhere.
+    is_listed
+        Their class must be of the vocabulary.
+    """
+
+    area: tuple[float, float, float, float] | None = None
+    is_listed: bool = False
+
+
+ANYTHING = Limits()
+
+
+@dataclass(frozen=True, slots=True)
 class Staged:
     """Detections dealt into batches below a folder, and the meaning of their codes."""
 
@@ -41,6 +61,7 @@ class Staged:
     fleet: dict[str, int]  # vehicles that report, a run
     rejected: pa.Table  # what the checks find, with the reason
     n_detections: int
+    n_of_class: tuple[int, ...]  # detections used, a class
     bias: BiasSummary | None = None
 
 
@@ -55,6 +76,7 @@ def stage_detections(
     n_vehicles: int,
     passes: Path | None = None,
     correct_bias: bool = False,
+    limits: Limits = ANYTHING,
 ) -> Staged:
     """Judge, number and tile the detections, and write a file a batch.
 
@@ -74,6 +96,8 @@ def stage_detections(
     passes, correct_bias
         Whether to take the range and bearing bias of each pass out first, and the `passes` table that declares how
         large these may be.
+    limits
+        What the detections must keep to.
 
     Raises
     ------
@@ -83,9 +107,8 @@ def stage_detections(
         A column is missing or mistyped.
     """
     fine_zoom = max(zoom, FINE_ZOOM)
-    plain = judge_detections(
-        connection, detections, n_vehicles=n_vehicles, fine_zoom=None if correct_bias else fine_zoom
-    )
+    fine = None if correct_bias else fine_zoom
+    plain = judge_detections(connection, detections, n_vehicles=n_vehicles, fine_zoom=fine, limits=limits)
     found = judged(connection)
     batch_rows = max(batch_rows, found.n_detections // MAX_BATCHES)
     bias = correct_passes(connection, detections, passes) if correct_bias else None
@@ -102,7 +125,8 @@ def stage_detections(
         materialise(connection, "tiles/counts", {"fine_zoom": fine_zoom})
     materialise(connection, "tiles/leaves", {"zoom": zoom, "fine_zoom": fine_zoom, "batch_rows": batch_rows})
     materialise(connection, "tiles/assign", {"batch_rows": batch_rows})
-    _deal(connection, folder, plain, fine_zoom=fine_zoom, halo_m=halo_m)
+    n_of_class = np.zeros(len(classes), np.int64)
+    _deal(connection, folder, plain, n_of_class, fine_zoom=fine_zoom, halo_m=halo_m)
     return Staged(
         folder=folder,
         tiles=connection.table("assign").to_arrow_table(),
@@ -110,6 +134,7 @@ def stage_detections(
         fleet=found.fleet,
         rejected=found.rejected,
         n_detections=found.n_detections,
+        n_of_class=tuple(n_of_class.tolist()),
         bias=bias,
     )
 
@@ -124,11 +149,16 @@ class Judged:
 
 
 def judge_detections(
-    connection: duckdb.DuckDBPyConnection, detections: Path, *, n_vehicles: int, fine_zoom: int | None = None
+    connection: duckdb.DuckDBPyConnection,
+    detections: Path,
+    *,
+    n_vehicles: int,
+    fine_zoom: int | None = None,
+    limits: Limits = ANYTHING,
 ) -> Survey | None:
     """Make the views and tables `judged`, `reporting`, `copies`, `fleet`, `passes` and `usable` of the detections.
 
-    With `fine_zoom`, return what a plain table holds, counted in cells of that zoom.
+    With `fine_zoom`, return what a plain table holds, counted in cells of that zoom, unless there are limits.
 
     Raises
     ------
@@ -136,8 +166,9 @@ def judge_detections(
         The table cannot be read, or a column is missing or mistyped.
     """
     bind_table(connection, DETECTIONS, detections, is_filled=True)
+    _bind_limits(connection, limits)
     create_view(connection, "aggregate/judged")
-    plain = survey(detections, fine_zoom) if fine_zoom else None
+    plain = survey(detections, fine_zoom) if fine_zoom and limits == ANYTHING else None
     if plain:
         keep_table(connection, plain.reporting, "reporting")
     else:
@@ -148,6 +179,19 @@ def judge_detections(
     materialise(connection, "aggregate/passes")
     _select_usable(connection)
     return plain
+
+
+def _bind_limits(connection: duckdb.DuckDBPyConnection, limits: Limits) -> None:
+    """Make the tables `area` and `unlisted`, empty where there is no such limit."""
+    if limits.area:
+        box = dict(zip(("west", "south", "east", "north"), map(float, limits.area), strict=True))
+        materialise(connection, "aggregate/area", box)
+    else:
+        make_empty(connection, "aggregate/area")
+    if limits.is_listed:
+        materialise(connection, "aggregate/unlisted", {"concepts": ",".join(load_taxonomy().concepts)})
+    else:
+        make_empty(connection, "aggregate/unlisted")
 
 
 def _select_usable(connection: duckdb.DuckDBPyConnection) -> None:
@@ -187,7 +231,7 @@ def _find_copies(connection: duckdb.DuckDBPyConnection) -> None:
     if connection.table("suspects").aggregate("count(*)").fetchall()[0][0]:
         materialise(connection, "aggregate/copies")
     else:
-        connection.sql(load_sql("aggregate/copies").text).limit(0).create("copies")
+        make_empty(connection, "aggregate/copies")
 
 
 def _number_classes(connection: duckdb.DuckDBPyConnection) -> tuple[str, ...]:
@@ -205,9 +249,15 @@ def _rejected(connection: duckdb.DuckDBPyConnection, *, n_invalid: int) -> pa.Ta
 
 
 def _deal(
-    connection: duckdb.DuckDBPyConnection, folder: Path, plain: Survey | None, *, fine_zoom: int, halo_m: float
+    connection: duckdb.DuckDBPyConnection,
+    folder: Path,
+    plain: Survey | None,
+    n_of_class: NDArray[np.int64],
+    *,
+    fine_zoom: int,
+    halo_m: float,
 ) -> None:
-    """Write every detection to the batches whose tiles read it."""
+    """Write every detection to the batches whose tiles read it, and count those of each class."""
     reach = {"fine_zoom": fine_zoom, "halo_m": halo_m, "n_around": math.ceil(halo_m / _CELL_M * 2.0**fine_zoom) or 1}
     materialise(connection, "tiles/readers", reach)
     found = connection.sql("SELECT * EXCLUDE (run_id) FROM readers").fetchnumpy()
@@ -218,7 +268,13 @@ def _deal(
     write_pass_hashes(folder, np.asarray(passes["pass_hash"], np.uint64))
     run_of_tile = np.searchsorted(run_ids, np.asarray(tiles["run_id"], str))
     dealer = Dealer(folder, readers, fine_zoom=fine_zoom, run_of_tile=run_of_tile, run_of_pass=run_of_pass)
-    dealer.deal_all(_plain_blocks(connection, plain) if plain else _blocks(connection))
+    dealer.deal_all(_counted(_plain_blocks(connection, plain) if plain else _blocks(connection), n_of_class))
+
+
+def _counted(blocks: Iterator[Columns], n_of_class: NDArray[np.int64]) -> Iterator[Columns]:
+    for block in blocks:
+        n_of_class += np.bincount(block["class_code"], minlength=n_of_class.size)
+        yield block
 
 
 def _plain_blocks(connection: duckdb.DuckDBPyConnection, plain: Survey) -> Iterator[Columns]:

@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 
 from geofleet.errors import TableError
 from geofleet.tables.database import materialise, run
-from geofleet.tables.staging import Judged, judge_detections, judged
+from geofleet.tables.staging import ANYTHING, Judged, Limits, judge_detections, judged
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,7 +30,9 @@ class StagedTracks:
         return run(self.connection, "aggregate/tracks_of_run", {"run_id": run_id}).to_arrow_table()
 
 
-def stage_tracks(connection: duckdb.DuckDBPyConnection, detections: Path, *, n_vehicles: int) -> StagedTracks:
+def stage_tracks(
+    connection: duckdb.DuckDBPyConnection, detections: Path, *, n_vehicles: int, limits: Limits = ANYTHING
+) -> StagedTracks:
     """Judge the detections and keep those that can be used.
 
     Raises
@@ -40,9 +42,15 @@ def stage_tracks(connection: duckdb.DuckDBPyConnection, detections: Path, *, n_v
     TableError
         A column is missing or mistyped.
     """
-    judge_detections(connection, detections, n_vehicles=n_vehicles)
+    judge_detections(connection, detections, n_vehicles=n_vehicles, limits=limits)
     materialise(connection, "aggregate/tracks")
     return StagedTracks(connection, judged(connection))
+
+
+def count_classes(staged: StagedTracks) -> dict[str, int]:
+    """Return how many detections are used of every class."""
+    rows = staged.connection.table("tracks").aggregate("sign_class, count(*)", "sign_class").fetchall()
+    return dict(sorted(rows))
 
 
 def prior_of_run(layer: pa.Table, run_id: str) -> pa.Table:

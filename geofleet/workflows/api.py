@@ -6,6 +6,7 @@ tables as the command does, in a temporary folder, so both give the same numbers
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -104,13 +105,18 @@ def aggregate(
     passes: GeoDataFrame | None = None,
     *,
     n_vehicles: int | None = None,
+    area: tuple[float, float, float, float] | None = None,
     **overrides: Any,
 ) -> GeoDataFrame:
     """Cluster detections and fuse them into a sign map; any key of a scenario may be overridden, e.g. `eps_m=3`.
 
     With `passes`, support is relative to the passes that had a place in view; with `correct_bias=True`, the bias of
     each pass is taken out first; with `min_samples=3`, clusters are scikit-learn's. `method="joint"` takes `passes` as
-    evidence of what was not seen, and a `prior` map.
+    evidence of what was not seen, and a `prior` map. Detections outside an `area` (west, south, east, north in degrees)
+    are left out.
+
+    Detections that cannot be used are left out with a warning; `.attrs` of what is returned counts them by reason
+    (`skipped`), and those of classes that the vocabulary does not know (`unknown_classes`).
 
     Raises
     ------
@@ -129,8 +135,15 @@ def aggregate(
         before = Path(folder) / "prior.parquet" if prior is not None else None
         if before:
             write_table(SIGNS, from_geodataframe(SIGNS, prior), before)
-        aggregate_step.aggregate(source, out, config=config, n_vehicles=n_vehicles, passes=driven, prior=before)
-        return _read(SIGNS, out)
+        result = aggregate_step.aggregate(
+            source, out, config=config, n_vehicles=n_vehicles, passes=driven, prior=before, area=area
+        )
+        fused = _read(SIGNS, out)
+    if result.n_rejected:
+        reasons = ", ".join(f"{n} {reason}" for reason, n in result.skipped.items())
+        warnings.warn(f"{result.n_rejected} of {result.n_detections} detections are left out: {reasons}.", stacklevel=2)
+    fused.attrs = {"skipped": result.skipped, "unknown_classes": result.unknown_classes}
+    return fused
 
 
 def score_map(map_: GeoDataFrame, reference: GeoDataFrame, gate_m: float = 2.0, match_on: str = "class") -> MapScore:

@@ -1,6 +1,6 @@
--- why: every detection with the reason why it cannot be used, or none: it must be placed, classed and named; ST_QuadKey
---      takes NaN and latitudes beyond Web Mercator without a word
--- reads: detections
+-- why: every detection with the reason why it cannot be used, or none: it must be placed, within the area where one is
+--      stated, classed and named; ST_QuadKey takes NaN and latitudes beyond Web Mercator without a word
+-- reads: detections, @aggregate/area, @aggregate/unlisted
 -- params: none
 -- writes: reason VARCHAR, run_id VARCHAR, vehicle_id VARCHAR, pass_id VARCHAR, track_id BIGINT, sign_class VARCHAR,
 --         lon DOUBLE, lat DOUBLE, n_frames BIGINT, var_m2 DOUBLE, class_confidence DOUBLE, t_first_us BIGINT,
@@ -13,6 +13,14 @@ SELECT
         WHEN bbox.xmin IS NULL OR bbox.ymin IS NULL THEN 'position missing'
         WHEN NOT (isfinite(bbox.xmin) AND isfinite(bbox.ymin)) THEN 'position not finite'
         WHEN abs(bbox.xmin) > 180 OR abs(bbox.ymin) > 85.05 THEN 'position out of range'
+        WHEN NOT ( -- null, that is not so, where no area is stated
+            bbox.ymin BETWEEN area.south AND area.north
+            AND CASE
+                WHEN area.west <= area.east THEN bbox.xmin BETWEEN area.west AND area.east
+                ELSE bbox.xmin >= area.west OR bbox.xmin <= area.east
+            END
+        ) THEN 'outside the area'
+        WHEN sign_class IN (SELECT sign_class FROM unlisted) THEN 'class unknown'
     END AS reason,
     run_id,
     vehicle_id,
@@ -38,3 +46,4 @@ SELECT
     info_s0,
     info_dof
 FROM detections
+LEFT JOIN area ON TRUE

@@ -260,11 +260,70 @@ def test_bad_rows_are_counted_and_set_aside_with_the_reason(tmp_path):
         (13, "class missing"),
     ]
     assert (result.n_detections, result.n_rejected, result.n_used) == (8, 5, 3)
-    assert any("5 detections could not be used" in line for line in result.summary())
+    assert result.skipped == {
+        "class missing": 1,
+        "key repeated": 1,
+        "position not finite": 1,
+        "position out of range": 2,
+    }
+    assert any("5 detections could not be used (1 class missing, " in line for line in result.summary())
+    assert json.loads((tmp_path / "fused_manifest.json").read_text())["counts"]["skipped"] == result.skipped
     assert read_table(SIGNS, out)["n_detections"].to_pylist() == [3]
     clean = run_on(tmp_path, good.slice(0, 3))
     assert clean.rejected is None
     assert not (tmp_path / "fused_rejected.parquet").exists()
+
+
+def test_detections_outside_the_stated_area_are_set_aside(tmp_path):
+    table, out = make_detections([[0, 0], [1, 0], [0, 1], [300, 0], [301, 0], [300, 1]]), tmp_path / "fused.parquet"
+    write_table(DETECTIONS, table, tmp_path / "d.parquet")
+    lon, lat = (np.round(value, 4) for value in HELSINKI.to_lonlat(np.array([[-50.0, -50.0], [50.0, 50.0]])))
+    area = (lon[0], lat[0], lon[1], lat[1])
+    config = load_config(overrides={"min_samples": 3})
+    assert aggregate(tmp_path / "d.parquet", out, config=config).n_signs == 2
+    result = aggregate(tmp_path / "d.parquet", out, config=config, area=area)
+    assert (result.n_signs, result.n_used, result.skipped) == (1, 3, {"outside the area": 3})
+    assert pq.read_table(result.rejected)["track_id"].to_pylist() == [3, 4, 5]
+    assert json.loads((tmp_path / "fused_manifest.json").read_text())["settings"]["area"] == list(area)
+    elsewhere = aggregate(tmp_path / "d.parquet", out, config=config, area=(10.0, 50.0, 11.0, 51.0))
+    assert (elsewhere.n_signs, elsewhere.skipped) == (0, {"outside the area": 6})
+    assert read_table(SIGNS, out).num_rows == 0
+
+
+def test_an_area_may_span_the_antimeridian(tmp_path):
+    table = make_detections([[-90, 0], [90, 0], [9000, 0]], frame=EnuFrame(180.0, 61.0))
+    write_table(DETECTIONS, table, tmp_path / "d.parquet")
+    config = load_config(overrides={"min_samples": 1, "min_support": 1})
+    found = aggregate(tmp_path / "d.parquet", tmp_path / "f.parquet", config=config, area=(179.9, 60, -179.9, 62))
+    assert (found.n_signs, found.n_rejected) == (2, 1)
+
+
+@pytest.mark.parametrize("area", [(1, 2, 1, 3), (1, 3, 2, 3), (-181, 2, 1, 3), (1, 2, 3, 91), (np.nan, 0, 1, 1)])
+def test_an_area_that_cannot_be_meant_is_refused(tmp_path, area):
+    with pytest.raises(ConfigError, match="is no area"):
+        aggregate(tmp_path / "d.parquet", tmp_path / "f.parquet", config=load_config(), area=area)
+
+
+@pytest.mark.parametrize("method", ["dbscan", "hdbscan", "joint"])
+def test_classes_that_the_vocabulary_does_not_know_are_told_and_kept_or_set_aside(tmp_path, method):
+    names = ["stop"] * 6 + ["speed_limit:50"] * 3 + ["raw:FI:999"] * 2 + ["odd", "odd:7"]
+    table = make_detections(np.arange(26).reshape(13, 2) / 20, sign_class=names)
+    kept = run_on(tmp_path, table, method=method)
+    assert (kept.n_used, kept.unknown_classes) == (13, {"raw:FI:999": 2, "odd": 1, "odd:7": 1})
+    assert kept.skipped == {}
+    strict = run_on(tmp_path, table, method=method, unknown_classes="reject")
+    assert (strict.n_used, strict.unknown_classes, strict.skipped) == (9, {}, {"class unknown": 4})
+    rejected = pq.read_table(strict.rejected)
+    assert sorted(rejected["sign_class"].to_pylist()) == ["odd", "odd:7", "raw:FI:999", "raw:FI:999"]
+    counts = json.loads((tmp_path / "fused_manifest.json").read_text())["counts"]
+    assert (counts["skipped"], counts["unknown_classes"]) == (strict.skipped, {})
+
+
+def test_many_unknown_classes_are_told_as_a_few(tmp_path):
+    table = make_detections(np.zeros((60, 2)), sign_class=[f"odd:{min(k, 29)}" for k in range(60)])
+    told = run_on(tmp_path, table).unknown_classes
+    assert list(told.items())[:2] == [("odd:29", 31), ("odd:0", 1)]
+    assert (len(told), told["10 more"]) == (21, 10)
 
 
 def test_no_detections_give_an_empty_layer_and_say_so(tmp_path):

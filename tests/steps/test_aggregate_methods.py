@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from pathlib import Path
+
 import numpy as np
 import pyarrow as pa
 import pytest
 import shapely
+from sklearn.cluster import DBSCAN
 
 from geofleet.algorithms import partitions
 from geofleet.algorithms.geodesy import EnuFrame
 from geofleet.config import load_config
 from geofleet.errors import ConfigError, InputError, TableError
 from geofleet.steps.aggregate import aggregate, tiles
+from geofleet.steps.ingest_detections import ingest_detections
 from geofleet.tables import staging
 from geofleet.tables.schemas import DETECTIONS, PASSES, REFERENCE, SIGNS
 from geofleet.tables.store import build_table, lonlat, read_table, write_table
@@ -208,3 +213,43 @@ def test_hot_tiles_are_split(tmp_path, monkeypatch):
     split = run_on(tmp_path, detections(), name="split", tile_zoom=12)
     assert split.n_tiles > 1
     assert split.out.read_bytes() == whole.out.read_bytes()
+
+
+BREMEN = Path(__file__).parents[3] / "shared" / "data" / "mapillary" / "mapillary_traffic-signs_DE-HB.parquet"
+
+
+@pytest.mark.skipif(not BREMEN.is_file(), reason=f"{BREMEN} is not on this machine")
+def test_bremen_as_mapillary_has_it_becomes_a_layer_without_copies(tmp_path):
+    """22,836 rows without covariance, passes or confidence; 695 stand where another row does, most of another class."""
+    ingest_detections([BREMEN], tmp_path / "detections", scheme="mapillary")
+    options = {"min_samples": 1, "min_support": 1}
+    result = aggregate(tmp_path / "detections", tmp_path / "fused.parquet", config=load_config(overrides=options))
+    table, fused = read_table(DETECTIONS, tmp_path / "detections"), read_table(SIGNS, result.out)
+    lon, lat = lonlat(table)
+    xy = EnuFrame.around(lon, lat).to_enu(lon, lat)
+    of_class = np.array(table["sign_class"].to_pylist())
+    places, of_place = np.unique(np.column_stack((lon, lat)), axis=0, return_inverse=True)
+    assert (len(lon), len(lon) - len(places)) == (22_836, 695)
+    assert len(set(table["pass_id"].to_pylist())) == 22_836  # each row is a pass of its own
+    assert result.skipped == {}
+    n_copies = len(lon) - len(set(zip(of_place.tolist(), of_class.tolist(), strict=True)))
+    assert n_copies == 109  # of one class; the other 586 are several signs of one pole
+    expected = Counter()
+    for name in set(of_class.tolist()):
+        of_name = xy[of_class == name]
+        labels = DBSCAN(eps=4.0, min_samples=1, algorithm="kd_tree").fit_predict(of_name)
+        for label in range(labels.max() + 1):
+            members = of_name[labels == label]
+            assert np.ptp(members, axis=0).max() <= 4.0 * (len(members) - 1) + 1e-6  # no wider than its links
+            expected[name, len(members)] += 1
+    assert Counter(zip(fused["sign_class"].to_pylist(), fused["n_detections"].to_pylist(), strict=True)) == expected
+    assert sum(fused["n_detections"].to_pylist()) == 22_836
+    at = list(zip(fused["sign_class"].to_pylist(), *(np.round(v, 9).tolist() for v in lonlat(fused)), strict=True))
+    assert len(set(at)) == len(at) == result.n_signs == 22_026
+    again = aggregate(
+        tmp_path / "detections",
+        tmp_path / "after.parquet",
+        config=load_config(overrides=options | {"semantic": "after"}),
+    )
+    spots = np.column_stack(lonlat(read_table(SIGNS, again.out)))
+    assert len(np.unique(spots, axis=0)) == len(spots) < len(places)  # class after: no spot twice, whatever its classes

@@ -67,3 +67,21 @@ def test_faults_are_named(signs, drive):
 def test_the_package_has_no_other_names():
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = gf.nothing
+
+
+def test_detections_that_cannot_be_used_are_told():
+    names = ["a", "b", "c", "d", "e", "f"]
+    table = geopandas.GeoDataFrame(
+        {"run_id": "r", "vehicle_id": names, "pass_id": names, "track_id": 1, "sign_class": ["odd"] * 4 + ["", "odd"]},
+        geometry=shapely.points([24.9] * 3 + [float("nan"), 24.9, 25.9], [60.2] * 6),
+        crs=4326,
+    )
+    with pytest.warns(UserWarning, match=r"2 of 6 detections are left out: 1 class missing, 1 position not finite\."):
+        fused = gf.aggregate(table)
+    assert fused["n_passes"].tolist() == [3]
+    assert fused.attrs == {
+        "skipped": {"class missing": 1, "position not finite": 1},
+        "unknown_classes": {"odd": 4},
+    }
+    with pytest.warns(UserWarning, match="1 outside the area"):
+        assert gf.aggregate(table, area=(24.0, 60.0, 25.0, 61.0)).attrs["unknown_classes"] == {"odd": 3}

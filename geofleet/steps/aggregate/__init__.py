@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow.compute as pc
 
-from geofleet.steps.aggregate.labels import method_label
+from geofleet.steps.aggregate.labels import check_area, method_label
 from geofleet.steps.aggregate.result import (
     AggregateResult,
     beside,
+    count_reasons,
     explain,
     few,
+    unknown_classes,
     write_rejected,
     write_result_manifest,
 )
@@ -30,6 +32,7 @@ from geofleet.tables.manifest import Hashing
 from geofleet.tables.opportunities import opportunities, read_passes
 from geofleet.tables.reference_counts import reference_counts
 from geofleet.tables.schemas import SIGNS
+from geofleet.tables.staging import Limits
 from geofleet.tables.store import write_pieces
 
 if TYPE_CHECKING:
@@ -56,6 +59,7 @@ def aggregate(
     passes: Path | None = None,
     k_from: Path | None = None,
     prior: Path | None = None,
+    area: tuple[float, float, float, float] | None = None,
     n_workers: int = 2,
     progress: Callable[[int, int], None] | None = None,
 ) -> AggregateResult:
@@ -79,6 +83,9 @@ def aggregate(
         semantic first), which no real job knows. The layer's method says `oracle-k`.
     prior
         An earlier map, in any format that `read_layer` knows: joint fusion takes its main signs as soft anchors.
+    area
+        West, south, east and north in degrees: detections outside are set aside; west beyond east is a box across the
+        antimeridian.
     n_workers
         Threads.
     progress
@@ -95,6 +102,7 @@ def aggregate(
         to another method than joint.
     """
     settings = config.aggregate
+    limits = Limits(check_area(area), is_listed=settings.unknown_classes == "reject")
     label = method_label(settings, k_from, prior)
     if settings.method == "joint":
         from geofleet.steps.aggregate.joint import fuse_jointly  # noqa: PLC0415  (0.5 s that the others can spare)
@@ -107,6 +115,7 @@ def aggregate(
             n_vehicles=n_vehicles,
             passes=passes,
             prior=prior,
+            limits=limits,
             n_workers=n_workers,
             progress=progress,
         )
@@ -115,7 +124,15 @@ def aggregate(
     inputs = Hashing(path for path in (detections, passes, k_from) if path)
     out.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}.") as folder:
-        staged = stage(detections, Path(folder), settings, n_vehicles=n_vehicles, passes=passes, n_workers=n_workers)
+        staged = stage(
+            detections,
+            Path(folder),
+            settings,
+            n_vehicles=n_vehicles,
+            passes=passes,
+            limits=limits,
+            n_workers=n_workers,
+        )
         if settings.method == "dbscan":
             clusters = cluster_tiles_of(staged, settings, n_workers=n_workers, progress=progress)
         else:
@@ -132,6 +149,8 @@ def aggregate(
         out=out,
         label=label,
         rejected=write_rejected(staged.rejected, out),
+        skipped=count_reasons(staged.rejected),
+        unknown_classes=unknown_classes(dict(zip(staged.classes, staged.n_of_class, strict=True))),
         run_ids=tuple(sorted(fleet)),
         n_vehicles=max(fleet.values(), default=0),
         n_detections=staged.n_detections,
@@ -142,7 +161,7 @@ def aggregate(
         n_signs=n_signs,
         notes=_notes(staged, n_vehicles),
     )
-    write_result_manifest(result, inputs, config)
+    write_result_manifest(result, inputs, config, limits)
     return result
 
 

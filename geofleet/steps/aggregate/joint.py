@@ -12,7 +12,15 @@ from geofleet.engines.batches import concatenate
 from geofleet.engines.joint import JointTask, fuse_run
 from geofleet.engines.local import run_tasks
 from geofleet.formats.layers import read_layer
-from geofleet.steps.aggregate.result import AggregateResult, beside, few, write_rejected, write_result_manifest
+from geofleet.steps.aggregate.result import (
+    AggregateResult,
+    beside,
+    count_reasons,
+    few,
+    unknown_classes,
+    write_rejected,
+    write_result_manifest,
+)
 from geofleet.steps.aggregate.tiles import DUCKDB_MEMORY
 from geofleet.tables.biases import BEARING_BIAS_SIGMA_DEG, RANGE_BIAS_SIGMA_M
 from geofleet.tables.database import connect
@@ -21,13 +29,14 @@ from geofleet.tables.manifest import Hashing
 from geofleet.tables.schemas import EVIDENCE, NUISANCE, PASSES, SIGNS
 from geofleet.tables.store import read_table, write_pieces, write_table
 from geofleet.tables.tracks import Assumed
-from geofleet.tables.tracks_staging import joint_classes, passes_of_run, prior_of_run, stage_tracks
+from geofleet.tables.tracks_staging import count_classes, joint_classes, passes_of_run, prior_of_run, stage_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from geofleet.config import Config
+    from geofleet.tables.staging import Limits
 
 
 def fuse_jointly(
@@ -39,6 +48,7 @@ def fuse_jointly(
     n_vehicles: int | None,
     passes: Path | None,
     prior: Path | None,
+    limits: Limits,
     n_workers: int,
     progress: Callable[[int, int], None] | None,
 ) -> AggregateResult:
@@ -50,7 +60,7 @@ def fuse_jointly(
     out.parent.mkdir(parents=True, exist_ok=True)
     connection = connect(threads=n_workers, memory_limit=DUCKDB_MEMORY, spatial=False)
     try:
-        staged = stage_tracks(connection, detections, n_vehicles=n_vehicles or 0)
+        staged = stage_tracks(connection, detections, n_vehicles=n_vehicles or 0, limits=limits)
         runs, classes = tuple(sorted(staged.judged.fleet)), joint_classes(staged, before)
         tasks = [
             JointTask(
@@ -65,6 +75,7 @@ def fuse_jointly(
             )
             for code, run_id in enumerate(runs)
         ]
+        n_of_class = count_classes(staged)
         found = list(run_tasks(fuse_run, tasks, n_workers=n_workers, progress=progress))
     finally:
         connection.close()
@@ -81,6 +92,8 @@ def fuse_jointly(
         out=out,
         label=label,
         rejected=write_rejected(staged.judged.rejected, out),
+        skipped=count_reasons(staged.judged.rejected),
+        unknown_classes=unknown_classes(n_of_class),
         run_ids=runs,
         n_vehicles=max(fleet.values(), default=0),
         n_detections=staged.judged.n_detections,
@@ -92,5 +105,5 @@ def fuse_jointly(
         notes=few(staged.judged.fleet, n_vehicles) + tuple(note for one in found for note in one.notes),
         n_suspect_passes=sum(pc.sum(one.nuisance["is_suspect"]).as_py() or 0 for one in found),
     )
-    write_result_manifest(result, inputs, config)
+    write_result_manifest(result, inputs, config, limits)
     return result

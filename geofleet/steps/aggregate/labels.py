@@ -1,4 +1,4 @@
-"""How a layer calls its method, and which options go together."""
+"""How a layer calls its method, which options go together, and what an area may be."""
 
 from __future__ import annotations
 
@@ -44,6 +44,26 @@ def method_label(settings: AggregateConfig, k_from: Path | None, prior: Path | N
             todo="Use --k-from REFERENCE for the number of signs a class, or leave K out to have it chosen.",
         )
     return f"{label}-oracle-k" if k_from else f"{label}-k{settings.k}" if settings.k else label
+
+
+def check_area(area: tuple[float, float, float, float] | None) -> tuple[float, float, float, float] | None:
+    """Return an area that can be meant.
+
+    Raises
+    ------
+    ConfigError
+        A side is out of range, or the south is not south of the north.
+    """
+    if area is None:
+        return None
+    west, south, east, north = area
+    if not (abs(west) <= 180 and abs(east) <= 180 and west != east and -90 <= south < north <= 90):  # noqa: PLR2004 - degrees
+        raise ConfigError(
+            f"{west:g},{south:g},{east:g},{north:g} is no area: it has no inside, or is not in degrees.",
+            where="--area",
+            todo="Give W,S,E,N, e.g. --area 24.93,60.16,24.96,60.18",
+        )
+    return area
 
 
 def _clustering(settings: AggregateConfig) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import pyarrow.compute as pc
@@ -12,6 +12,7 @@ from geofleet.errors import InputError
 from geofleet.tables.manifest import write_manifest
 from geofleet.tables.schemas import EVIDENCE
 from geofleet.tables.store import atomic_path, read_table
+from geofleet.taxonomy.reader import load_taxonomy
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,15 +21,21 @@ if TYPE_CHECKING:
 
     from geofleet.config import Config
     from geofleet.tables.manifest import Hashing
+    from geofleet.tables.staging import Limits
+
+
+_MAX_CLASSES = 20  # that are told one by one
 
 
 @dataclass(frozen=True, slots=True)
 class AggregateResult:
     """What became of the detections.
 
-    `label` is what the layer calls its method. `n_detections` and `n_rejected` count the whole table, `n_used` the
-    vehicles asked for; signs are clusters with enough passes. `n_tiles` is None where runs are estimated whole.
-    `n_suspect_passes`, of joint fusion only, are those far from what they declare.
+    `label` is what the layer calls its method. `skipped` counts the rejected detections by reason,
+    `unknown_classes` those that are used by class where the vocabulary does not have it, the most frequent ones.
+    `n_detections` and `n_rejected` count the whole table, `n_used` the vehicles asked for; signs are clusters with
+    enough passes. `n_tiles` is None where runs are estimated whole. `n_suspect_passes`, of joint fusion only, are
+    those far from what they declare.
     """
 
     out: Path
@@ -42,6 +49,8 @@ class AggregateResult:
     n_tiles: int | None
     n_clusters: int
     n_signs: int
+    skipped: dict[str, int] = field(default_factory=dict)
+    unknown_classes: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     n_suspect_passes: int | None = None
 
@@ -57,7 +66,8 @@ class AggregateResult:
             *self.notes,
         ]
         if self.rejected:
-            lines.append(f"{self.n_rejected} detections could not be used: {self.rejected}")
+            reasons = ", ".join(f"{n} {reason}" for reason, n in self.skipped.items())
+            lines.append(f"{self.n_rejected} detections could not be used ({reasons}): {self.rejected}")
         return [*lines, f"Written: {self.out}"]
 
 
@@ -96,6 +106,22 @@ def write_rejected(rejected: pa.Table, out: Path) -> Path | None:
     return path
 
 
+def count_reasons(rejected: pa.Table) -> dict[str, int]:
+    """Return how many rows each reason kept out, by reason."""
+    counts = pc.value_counts(rejected["reason"]).to_pylist()
+    return dict(sorted((row["values"], row["counts"]) for row in counts))
+
+
+def unknown_classes(n_of_class: dict[str, int]) -> dict[str, int]:
+    """Return the counts of the classes whose concept the vocabulary does not have, the most frequent first."""
+    known = load_taxonomy().concepts
+    counts = {name: n for name, n in n_of_class.items() if n and name.partition(":")[0] not in known}
+    order = sorted(counts, key=lambda name: (-counts[name], name))
+    few_of = {name: counts[name] for name in order[:_MAX_CLASSES]}
+    left = len(order) - len(few_of)
+    return few_of | ({f"{left} more": sum(counts[name] for name in order[_MAX_CLASSES:])} if left else {})
+
+
 def few(fleet: dict[str, int], n_vehicles: int | None) -> tuple[str, ...]:
     """Return where fewer vehicles report than were asked for."""
     if not fleet:
@@ -107,9 +133,18 @@ def few(fleet: dict[str, int], n_vehicles: int | None) -> tuple[str, ...]:
     )
 
 
-def write_result_manifest(result: AggregateResult, inputs: Hashing, config: Config) -> None:
+def write_result_manifest(result: AggregateResult, inputs: Hashing, config: Config, limits: Limits) -> None:
     """Write the manifest of a layer, last of all."""
-    names = ["n_vehicles", "n_detections", "n_rejected", "n_used", "n_clusters", "n_signs"]
+    names = [
+        "n_vehicles",
+        "n_detections",
+        "n_rejected",
+        "n_used",
+        "n_clusters",
+        "n_signs",
+        "skipped",
+        "unknown_classes",
+    ]
     if result.n_suspect_passes is not None:  # only joint fusion looks
         names.append("n_suspect_passes")
     write_manifest(
@@ -117,6 +152,6 @@ def write_result_manifest(result: AggregateResult, inputs: Hashing, config: Conf
         step="aggregate",
         inputs=inputs,
         config_digest=config.digest("aggregate"),
-        settings={**config.aggregate.model_dump(), "label": result.label},
+        settings={**config.aggregate.model_dump(), "label": result.label, "area": limits.area},
         counts={name: getattr(result, name) for name in names},
     )

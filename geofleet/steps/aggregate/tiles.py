@@ -12,7 +12,7 @@ from geofleet.engines.local import release_memory, run_tasks
 from geofleet.tables.arrays import numpy_numbers
 from geofleet.tables.database import connect
 from geofleet.tables.dealt import batch_path
-from geofleet.tables.staging import Staged, stage_detections
+from geofleet.tables.staging import Limits, Staged, stage_detections
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,6 +40,7 @@ def stage(
     *,
     n_vehicles: int | None,
     passes: Path | None,
+    limits: Limits,
     n_workers: int,
 ) -> Staged:
     """Deal the detections into batches below a folder."""
@@ -55,6 +56,7 @@ def stage(
             n_vehicles=n_vehicles or 0,
             passes=passes,
             correct_bias=settings.correct_bias,
+            limits=limits,
         )
     finally:
         connection.close()
