@@ -110,17 +110,72 @@ def test_signs_of_the_fzi_map_stand_where_lanelet2_puts_them(fzi):
     assert layer.skipped == {"deleted elements": 1}
 
 
+def drawn_map(draw):
+    """Return a map of a few winding lanelets in some direction, each with a sign of one to four points."""
+    nodes, ways, relations = [], [], []
+
+    def line(number, points, tags=""):
+        first = len(nodes) + 1
+        nodes.extend(points)
+        refs = "".join(f'<nd ref="{n}"/>' for n in range(first, len(nodes) + 1))
+        ways.append(f'<way id="{number}">{refs}{tags}</way>')
+
+    for lane in range(draw.randint(1, 5)):
+        course, width = draw.uniform(0, 2 * np.pi), draw.uniform(2, 5)
+        n = draw.randint(2, 12)
+        along = np.cumsum([draw.uniform(1, 20) for _ in range(n)])
+        across = np.cumsum([draw.uniform(-0.5, 0.5) for _ in range(n)])
+        for side in (0, 1):
+            x, y = along * np.cos(course) - (across - side * width) * np.sin(course), along * np.sin(course)
+            y = y + (across - side * width) * np.cos(course)
+            places = [(49.01 + b / 111_200 + lane * 1e-3, 8.42 + a / 73_000) for a, b in zip(x, y, strict=True)]
+            line(1_000 + 10 * lane + side, places[:: draw.choice((1, 1, 2))] if n > 4 else places)
+        sign = '<tag k="type" v="traffic_sign"/><tag k="subtype" v="de205"/>'
+        line(1_005 + 10 * lane, [(a + 1e-6 * k, o + 2e-6 * k) for k, (a, o) in enumerate(places[-3:])], sign)
+        sides = f'<member type="way" ref="{1_000 + 10 * lane}" role="left"/>'
+        sides += f'<member type="way" ref="{1_001 + 10 * lane}" role="right"/>'
+        relations.append(
+            f'<relation id="{2_000 + lane}">{sides}<tag k="type" v="lanelet"/><tag k="subtype" v="road"/></relation>'
+        )
+    points = "".join(f'<node id="{n + 1}" lat="{lat:.11f}" lon="{lon:.11f}"/>' for n, (lat, lon) in enumerate(nodes))
+    return f'<osm version="0.6">{points}{"".join(ways)}{"".join(relations)}</osm>'
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_drawn_map_agrees_with_the_lanelet2_package(seed, write):
+    path = write(drawn_map(random.Random(seed)))  # noqa: S311 - not a secret
+    map_, projector = agrees_with_the_package(path)
+    signs = rows_of(read_signs(path))
+    theirs = [way for way in map_.lineStringLayer if dict(way.attributes).get("type") == "traffic_sign"]
+    assert len(theirs) == len(signs) > 0
+    for way in theirs:
+        degrees = [projector.reverse(lanelet2_point(one)) for one in way]
+        lon, lat = np.mean([(one.lon, one.lat) for one in degrees], axis=0)
+        box = signs[f"w{way.id}"]["bbox"]
+        assert GEOD.inv(box["xmin"], box["ymin"], lon, lat)[2] < 1e-3
+
+
 def test_the_whole_fzi_map_agrees_with_the_lanelet2_package(fzi):
+    agrees_with_the_package(fzi)
+
+
+def lanelet2_point(point):
+    return pytest.importorskip("lanelet2").core.BasicPoint3d(point.x, point.y, 0)
+
+
+def agrees_with_the_package(path):
     lanelet2 = pytest.importorskip("lanelet2", reason="the oracle is not installed")
     projector = lanelet2.projection.UtmProjector(lanelet2.io.Origin(49.0, 8.42))
-    map_, _ = lanelet2.io.loadRobust(str(fzi), projector)
-    lanes = dict(zip(*(read_lanes(fzi).table[name].to_pylist() for name in ("lane_id", "geometry")), strict=True))
+    map_, _ = lanelet2.io.loadRobust(str(path), projector)
+    lanes = dict(zip(*(read_lanes(path).table[name].to_pylist() for name in ("lane_id", "geometry")), strict=True))
+    assert len(list(map_.laneletLayer)) > 0
     for lanelet in map_.laneletLayer:
         line = shapely.get_coordinates(shapely.from_wkb(lanes[f"r{lanelet.id}"]))
         centre = list(lanelet.centerline)
         for ours, theirs in ((line[0], centre[0]), (line[-1], centre[-1])):
-            place = projector.reverse(lanelet2.core.BasicPoint3d(theirs.x, theirs.y, 0))
+            place = projector.reverse(lanelet2_point(theirs))
             assert GEOD.inv(*ours, place.lon, place.lat)[2] < 1e-3
+    return map_, projector
 
 
 def test_counts_of_the_fzi_map(fzi):

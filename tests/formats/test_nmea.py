@@ -3,9 +3,13 @@ from __future__ import annotations
 import random
 from datetime import UTC, datetime
 from functools import reduce
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from geofleet.errors import SUSPICIOUS, InputError
 from geofleet.formats.drives import detect, read_drive
@@ -175,6 +179,36 @@ def test_positions_are_those_of_pynmea2(shared_data):
     epochs, _, _ = read_epochs(path)
     np.testing.assert_allclose(epochs.lat, [m.latitude for m in oracle], atol=1e-12)
     np.testing.assert_allclose(epochs.lon, [m.longitude for m in oracle], atol=1e-12)
+
+
+@settings(max_examples=25)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 89), st.integers(0, 179), st.integers(1, 59_999_999), st.sampled_from(["NE", "SW"])),
+        min_size=1,
+        max_size=20,
+    )
+)
+def test_made_up_positions_are_those_of_pynmea2(places):
+    pynmea2 = pytest.importorskip("pynmea2")
+    lines = [rmc("092500.00").strip()]
+    for second, (lat, lon, part, (north, east)) in enumerate(places):
+        minutes = f"{part // 1_000_000:02d}.{part % 1_000_000:06d}"
+        clock = f"0925{second:02d}.00"
+        lines.append(
+            sentence(f"GNGGA,{clock},{lat:02d}{minutes},{north},{lon:03d}{minutes},{east},4,12,0.5,9.0,M,,M,,")
+        )
+    lines = [line.strip() for line in lines]
+    oracle = [pynmea2.parse(line, check=True) for line in lines if "GGA" in line]
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "made.nmea"
+        path.write_text("\r\n".join([*lines, ""]), encoding="ascii")
+        epochs, skipped, _ = read_epochs(path)
+    assert not skipped["sentences with a wrong checksum"]
+    np.testing.assert_allclose(epochs.lat, [one.latitude for one in oracle], atol=1e-12)
+    np.testing.assert_allclose(epochs.lon, [one.longitude for one in oracle], atol=1e-12)
+    clocks = [str(one.timestamp)[:8] for one in oracle]
+    assert [str(time)[11:19] for time in epochs.t_utc] == clocks
 
 
 def test_checksums_are_the_exclusive_or_of_their_bytes():

@@ -590,24 +590,46 @@ def test_every_record_of_ingolstadt_starts_where_the_one_before_ends(shared_data
     assert max(gaps) < 1e-3
 
 
+GEOMETRIES = {
+    "line": "<line/>",
+    "arc": '<arc curvature="{}"/>',
+    "spiral": '<spiral curvStart="{}" curvEnd="0.004"/>',
+    "poly3": '<poly3 a="0" b="0" c="{}" d="-0.00001"/>',
+    "paramPoly3": '<paramPoly3 pRange="normalized" aU="0" bU="50" cU="-1" dU="0" aV="0" bV="0" cV="{}" dV="1"/>',
+}
+
+
+@pytest.mark.parametrize("kind", GEOMETRIES)
+@pytest.mark.parametrize("bend", [-0.01, 0.0001, 0.02])
+def test_one_geometry_agrees_with_pyxodr(kind, bend, path):
+    body = GEOMETRIES[kind].format(bend)
+    plan = f'<geometry s="0" x="20" y="-30" hdg="0.7" length="50">{body}</geometry>'
+    agrees_with_pyxodr(path(document(road(plan=plan, length=50))), 0.1)
+
+
 def test_reference_lines_agree_with_pyxodr(shared_data):
-    etree = pytest.importorskip("lxml.etree", reason="pyxodr, an oracle, is not installed")
-    network = pytest.importorskip("pyxodr.road_objects.road", reason="pyxodr, an oracle, is not installed")
     # Theirs is interpolated linearly: on tight bends it nears ours with its resolution (71, 4.5, 0.8 mm off in
     # Ingolstadt at 0.5, 0.2, 0.1 m)
     named = {"ingolstadt_cityhall": 0.1, "a9_nord_excerpt_bssd": 0.2, "carla_Town01_partial_georef": 0.2}
     for name, resolution in named.items():
-        file = shared_data / "opendrive" / f"{name}.xodr"
-        theirs = {
-            r.get("id"): network.Road(r, resolution=resolution) for r in etree.parse(str(file)).getroot().iter("road")
-        }
-        for element in header_and_roads(file, ("lanes", "objects")):
-            if element.tag == "road":
-                road = read_road(element)
-                x, y, _ = reference_points(road.plan, np.linspace(0, road.plan.end_m, 4000))
-                line = shapely.linestrings(np.column_stack((x, y)))
-                points = shapely.points(theirs[road.road_id].reference_line[:, :2])
-                assert shapely.distance(line, points).max() < 0.001
+        agrees_with_pyxodr(shared_data / "opendrive" / f"{name}.xodr", resolution)
+
+
+def agrees_with_pyxodr(file, resolution):
+    etree = pytest.importorskip("lxml.etree", reason="pyxodr, an oracle, is not installed")
+    network = pytest.importorskip("pyxodr.road_objects.road", reason="pyxodr, an oracle, is not installed")
+    theirs = {
+        r.get("id"): network.Road(r, resolution=resolution) for r in etree.parse(str(file)).getroot().iter("road")
+    }
+    n_roads = 0
+    for element in header_and_roads(file, ("lanes", "objects")):
+        if element.tag == "road":
+            ours, n_roads = read_road(element), n_roads + 1
+            x, y, _ = reference_points(ours.plan, np.linspace(0, ours.plan.end_m, 4000))
+            line = shapely.linestrings(np.column_stack((x, y)))
+            points = shapely.points(theirs[ours.road_id].reference_line[:, :2])
+            assert shapely.distance(line, points).max() < 0.001
+    assert n_roads == len(theirs) > 0
 
 
 @pytest.fixture
