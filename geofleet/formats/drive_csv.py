@@ -211,13 +211,14 @@ def _of_time(
     """Return UTC, or seconds, of the column of times, and what to tell."""
     names, chosen = layout.columns, layout.time_format
     text, told = _text_of_times(frame, names, day_first=layout.day_first)
-    if chosen in (None, "velocity"):
-        chosen = guess_format(text, names.get("time", ""))
-        t_utc, elapsed_s = times_of(text, chosen, day_first=layout.day_first)
-        if chosen == RELATIVE_S and elapsed_s is not None:
-            chosen = unit_by_speed(elapsed_s, lon, lat)
-        told[f"times read as {chosen} (guessed)"] = len(text)
+    is_guessed = chosen in (None, "velocity")
+    chosen = guess_format(text, names.get("time", "")) if is_guessed or chosen is None else chosen
     t_utc, elapsed_s = times_of(text, chosen, day_first=layout.day_first)
+    if is_guessed and chosen == RELATIVE_S and elapsed_s is not None:
+        chosen = unit_by_speed(elapsed_s, lon, lat)
+        t_utc, elapsed_s = times_of(text, chosen)
+    if is_guessed:
+        told[f"times read as {chosen} (guessed)"] = len(text)
     if "nanoseconds" in names:
         rest_s = _numbers(frame, names["nanoseconds"]) * 1e-9
         t_utc, elapsed_s = t_utc + microseconds(rest_s), None if elapsed_s is None else elapsed_s + rest_s

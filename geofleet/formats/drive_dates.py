@@ -21,8 +21,10 @@ COMPACT_CLOCK = r"\d{6}(?:\.\d*)?"
 COMPACT = r"(?:19|20)\d{12}(?:\d{3}|\.\d*)?"
 _NAMED_UTC = r"(?<=\d)\s*(?:UTC|GMT)$"
 _ZONE = r"(?:Z|[+-]\d{2}(?::?\d{2})?|UTC|GMT)\s*$"
+_WRITTEN_OUT = r"[A-Za-z]{3}"
 _OFFSET = r"(?:\s*(?P<zone>Z|(?:UTC|GMT)?[+-]\d{2}:?\d{2}|UTC|GMT))?"
 EXCEL_DAYS = (29_221.0, 73_050.0)  # 1980 to 2099
+_HAS_CLOCK = r"\d[ T]\d{1,2}:\d{2}"
 _DAY_S = 86_400.0
 _MONTHS = {
     name: f"{number:02d}"
@@ -68,8 +70,10 @@ def parse_dates(text: pd.Series[str], *, day_first: bool | None = None) -> Times
 
 def n_without_zone(text: pd.Series[str]) -> int:
     """Return how many dates of a column do not say in which time zone they are."""
-    plain = _rewritten(text.dropna())
-    return int((~plain.str.contains(_ZONE, na=True, regex=True)).sum())
+    plain = text.dropna()
+    bare = plain[~plain.str.contains(_ZONE, regex=True)]
+    is_written = bare.str.contains(_WRITTEN_OUT, regex=True)  # 14:05:06 GMT+01:00 2019
+    return int((~is_written).sum()) + int((~_rewritten(bare[is_written]).str.contains(_ZONE, regex=True)).sum())
 
 
 def clock_seconds(text: pd.Series[str]) -> NDArray[np.float64]:
@@ -90,8 +94,11 @@ def dated(
     """Return times of the day with the dates of another column before them, and what to tell.
 
     Dates are texts, `20240321`, `210324` (which only `day_first` tells from `240321`) or a spreadsheet's days; times
-    are `13:05:06`, `130506.2` or a fraction of a day. Times that hold more than a time of the day stay as they are.
+    are `13:05:06`, `130506.2` or a fraction of a day. Times that hold more than a time of the day stay as they are, and
+    dates that hold it stand alone.
     """
+    if bool(date.str.contains(_HAS_CLOCK, na=True, regex=True).all()):
+        return date, {}
     clock = time.where(time.str.fullmatch(CLOCK), time.str.replace(r"^(\d{5})(?=\.|$)", r"0\1", regex=True))
     fraction = pd.to_numeric(time.str.replace(",", ".", regex=False), errors="coerce")
     if bool((fraction < 1).all()):

@@ -73,6 +73,7 @@ def read_epochs(path: Path) -> tuple[dict[str, Epochs], dict[str, int], dict[str
     is_line, is_point = np.isin(kind, (_LINE, _LINES)), kind == _POINT
     if geometry is None or not (is_line.any() or is_point.any()):
         raise InputError("holds neither points nor lines.", where=str(path), todo="Give points with a time, or a line.")
+    _refuse_map(path, features.table, is_line, is_point)
     chosen = is_line if is_line.sum() >= is_point.sum() or not _time_of(features.table) else is_point
     rows = np.flatnonzero(chosen)
     read = _of_lines if chosen is is_line else _of_points
@@ -87,6 +88,18 @@ def read_epochs(path: Path) -> tuple[dict[str, Epochs], dict[str, int], dict[str
     number, names = pd.factorize(vertices.drive)  # numpy takes "a\0" for "a" where it compares
     drives = {names[n]: epochs.take(placed & (number == n)) for n in dict.fromkeys(number[placed].tolist())}
     return drives, skipped, features.found | vertices.found, crs
+
+
+def _refuse_map(path: Path, table: pa.Table, is_line: NDArray[np.bool_], is_point: NDArray[np.bool_]) -> None:
+    """Refuse what has no times and more than one feature: signs or streets, and no way driven."""
+    is_timed = bool(_time_of(table)) if is_point.any() else bool(set(_VERTEX_TIMES) & set(table.column_names))
+    if not is_timed and int(is_line.sum() + is_point.sum()) > 1:
+        what = f"{int(is_line.sum())} lines and {int(is_point.sum())} points without times"
+        raise InputError(
+            f"holds {what}, which are no drive.",
+            where=str(path),
+            todo="Give points with a column time, lines with coordTimes, or one line alone.",
+        )
 
 
 def _of_points(table: pa.Table, geometry: NDArray[np.object_]) -> _Vertices:

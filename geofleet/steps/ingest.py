@@ -169,8 +169,8 @@ def ingest_drive(
     def reader(name: str) -> Reader:
         return lambda path: drives.read_drive(path, name, **options)
 
-    chosen = drives.CSV if options and file_format == "auto" else file_format
-    plan = _plan(inputs, chosen, drives.FORMATS, {name: reader(name) for name in drives.FORMATS})
+    readers = {name: reader(name) for name in drives.FORMATS}
+    plan = _plan(inputs, file_format, drives.FORMATS, readers, otherwise=drives.CSV if options else "")
     settings = {name: str(value.name if isinstance(value, Path) else value) for name, value in options.items()}
     return _ingest(DRIVES, "fix_quality", plan, out, progress=progress, settings=settings)
 
@@ -189,9 +189,17 @@ def recognise(path: Path) -> str:
 
 
 def _plan(
-    inputs: Sequence[Path], file_format: str, formats: Mapping[str, str], readers: Mapping[str, Reader]
+    inputs: Sequence[Path],
+    file_format: str,
+    formats: Mapping[str, str],
+    readers: Mapping[str, Reader],
+    *,
+    otherwise: str,
 ) -> list[tuple[Path, str, Reader]]:
-    """Return path, format and reader of each input; every file is looked at before the first is read."""
+    """Return path, format and reader of each input; every file is looked at before the first is read.
+
+    A file of an unknown kind is read as the format `otherwise`, where there is one.
+    """
     supported = "; ".join(f"{name}: {what}" for name, what in formats.items())
     if not inputs:
         raise InputError("no input file is named.", todo=f"Supported are {supported}.")
@@ -199,7 +207,7 @@ def _plan(
         raise InputError(f"unknown format {file_format!r}.", where="--format", todo=f"Supported are auto; {supported}.")
     plan = []
     for path in map(Path, inputs):
-        found = recognise(path) if file_format == "auto" else file_format
+        found = (recognise(path) or otherwise) if file_format == "auto" else file_format
         if found not in readers:
             what = f"a file of format {found}, which is not read here" if found else "not in a format that is read here"
             raise InputError(f"{what}.", where=str(path), todo=f"Supported are {supported}.")

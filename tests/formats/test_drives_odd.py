@@ -10,9 +10,10 @@ import geopandas as gpd
 import numpy as np
 import pytest
 
-from geofleet.errors import InputError
+from geofleet.errors import ConfigError, InputError
 from geofleet.formats.drives import read_drive
 from geofleet.formats.inventory_columns import angle
+from geofleet.steps.ingest import ingest_drive
 from geofleet.tables.store import lonlat
 from geofleet.workflows.info import info
 
@@ -310,3 +311,30 @@ def test_a_spreadsheet_is_named(tmp_path):
     for read in (read_drive, info):
         with pytest.raises(InputError, match=r"spreadsheet of Excel: not read here. Save the sheet as CSV"):
             read(path)
+
+
+@pytest.mark.parametrize(
+    ("geometry", "properties"),
+    [
+        ({"type": "Point", "coordinates": [11.5, 48.1]}, {"code": "206"}),
+        ({"type": "LineString", "coordinates": [[11.5, 48.1], [11.6, 48.1]]}, {"highway": "primary"}),
+    ],
+)
+def test_signs_and_streets_are_no_drive(tmp_path, geometry, properties):
+    path = tmp_path / "map.geojson"
+    feature = {"type": "Feature", "properties": properties, "geometry": geometry}
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature] * 3}))
+    with pytest.raises(InputError, match="without times, which are no drive"):
+        read_drive(path)
+
+
+def test_a_date_that_holds_the_clock_stands_alone(tmp_path):
+    path = written(tmp_path, "Date,Time,lat,lon", "{t:%Y-%m-%d %H:%M:%S},{t:%H:%M:%S}," + PLACE)
+    assert read_drive(path).table["t_utc"].to_pylist() == TIMES
+
+
+def test_options_of_csv_are_refused_for_other_formats_by_name(tmp_path):
+    path = tmp_path / "drive.gpx"
+    path.write_text('<gpx><trk><trkseg><trkpt lat="48" lon="11"/></trkseg></trk></gpx>')
+    with pytest.raises(ConfigError, match="crs cannot be given for gpx"):
+        ingest_drive([path], tmp_path / "drives.parquet", crs="EPSG:4326")
