@@ -197,8 +197,7 @@ def _sort_into_cells(points: Floats, groups: Ints, coords: Floats, eps_m: float)
     order = kernels.radix_argsort(keys, np.arange(len(points)))
     first = kernels.cell_starts(keys, order)
     window = kernels.cell_windows(keys[order[first[:-1]]], n_columns)
-    axes = tuple(coords[order, axis] for axis in range(coords.shape[1]))
-    return kernels.Cells(axes, order, first, window)
+    return kernels.Cells(tuple(kernels.take_axes(coords, order)), order, first, window)
 
 
 def _cell_numbers(values: Floats, side: float) -> tuple[Ints, int]:

@@ -65,6 +65,25 @@ def radix_argsort(keys: Ints, order: Ints) -> Ints:
 
 
 @kernel
+def is_in_order(major: Ints, minor: Ints) -> bool:
+    """Return whether rows are sorted by two keys."""
+    for i in range(1, major.size):
+        if major[i] < major[i - 1] or (major[i] == major[i - 1] and minor[i] < minor[i - 1]):
+            return False
+    return True
+
+
+@kernel
+def take_axes(coords: Floats, order: Ints) -> Floats:
+    """Return the coordinates (n, d) of points in an order, axis by axis: (d, n)."""
+    axes = np.empty((coords.shape[1], order.size))
+    for i in range(order.size):
+        for axis in range(coords.shape[1]):
+            axes[axis, i] = coords[order[i], axis]
+    return axes
+
+
+@kernel
 def cell_starts(keys: Ints, order: Ints) -> Ints:
     """Return where each run of equal keys starts in `order`, and the number of points at the end."""
     first = np.empty(order.size + 1, np.int64)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from geofleet.algorithms.clustering_kernels import radix_argsort
+from geofleet.algorithms.clustering_kernels import is_in_order, radix_argsort
 from geofleet.algorithms.fusion import fuse, hash_members, information_weights, move_to_members, vote
 from geofleet.algorithms.geodesy_kernels import ecef_points
 from geofleet.algorithms.tiling import cluster_tiles, join_open, quadkey_bounds, split_chains
@@ -82,7 +82,7 @@ def cluster_batch(task: TileTask) -> TileResult:
         min_samples=task.min_samples,
         ecef_m=rows["ecef_m"],
     )
-    open_rows = {name: rows[name][found.open_row] for name in _OPEN}
+    open_rows = {name: rows[name].take(found.open_row) for name in _OPEN}
     open_rows |= {"cluster": found.open_cluster, "is_core": found.open_is_core}
     return TileResult(fuse_members(rows, found.closed_row, found.closed_cluster, splitter=splitter(task)), open_rows)
 
@@ -141,16 +141,16 @@ def fuse_members(
     """
     if cluster.size == 0:
         return {}
-    order = _key_order(rows["track_id"][member], rows["pass_code"][member])
+    order = _key_order(rows["track_id"].take(member), rows["pass_code"].take(member))
     order = radix_argsort(cluster, order)
-    taken, cluster = member[order], cluster[order]
-    rows = {name: values[taken] for name, values in rows.items() if name in _FUSED}
+    taken, cluster = member.take(order), cluster.take(order)
+    rows = {name: values.take(taken, axis=0) for name, values in rows.items() if name in _FUSED}
     if splitter:
         split = splitter(rows["lon"], rows["lat"], cluster)
         if split is not cluster:
             kept = np.flatnonzero(split >= 0)
             kept = kept[radix_argsort(split[kept], np.arange(kept.size))]  # stable: in a cluster they stay by key
-            rows, cluster = {name: values[kept] for name, values in rows.items()}, split[kept]
+            rows, cluster = {name: values.take(kept, axis=0) for name, values in rows.items()}, split[kept]
     first = np.append(np.flatnonzero(np.diff(cluster, prepend=-1)), cluster.size)
     lead = first[:-1]
     weight = information_weights(rows["var_m2"]) if is_weighted else np.ones(cluster.size)
@@ -183,7 +183,9 @@ def fuse_members(
 
 
 def _key_order(track_id: Ints, pass_code: Ints) -> Ints:
-    """Return the order by pass and track."""
+    """Return the order by pass and track, in which a geofleet table and so its batches often are."""
+    if is_in_order(pass_code, track_id):
+        return np.arange(track_id.size)
     if track_id.min(initial=0) < 0:  # the radix sort takes no negative keys
         return np.lexsort((track_id, pass_code))
     return radix_argsort(pass_code, radix_argsort(track_id, np.arange(track_id.size)))

@@ -85,6 +85,6 @@ def write_pass_hashes(folder: Path, hashes: NDArray[np.uint64]) -> None:
 
 def read_rows(path: Path) -> Columns:
     """Read a batch: one array a column of `sql/tiles/members`, and the hash of each row's pass."""
-    columns: Columns = dict(zip(_ROW.names or (), unpack_rows(np.fromfile(path, _ROW)), strict=True))
+    columns: Columns = dict(zip(_ROW.names or (), unpack_rows(np.memmap(path, _ROW, "r")), strict=True))
     hashes = np.load(path.with_name(_HASHES_OF_PASSES), mmap_mode="r")
-    return columns | {"pass_hash": hashes[columns["pass_code"]]}
+    return columns | {"pass_hash": hashes.take(columns["pass_code"])}

@@ -8,7 +8,7 @@ import numpy as np
 
 from geofleet.algorithms.tiling import halo_m
 from geofleet.engines.batches import TileTask, cluster_batch, concatenate, fuse_open, splitter
-from geofleet.engines.local import release_memory, run_tasks
+from geofleet.engines.local import keep_freed_memory, release_memory, run_tasks
 from geofleet.tables.arrays import numpy_numbers
 from geofleet.tables.database import connect
 from geofleet.tables.dealt import batch_path
@@ -44,6 +44,7 @@ def stage(
     n_workers: int,
 ) -> Staged:
     """Deal the detections into batches below a folder."""
+    keep_freed_memory()
     connection = connect(threads=n_workers, memory_limit=DUCKDB_MEMORY, spatial=False)
     try:
         return stage_detections(
