@@ -115,12 +115,27 @@ def _find_beside(slots: Ints, key: int, x: float, y: float) -> int:
     return EMPTY
 
 
-@inlined_kernel
-def place(lon_deg: float, lat_deg: float, side: int) -> tuple[float, float]:
-    """Return column and row of a cell, with the fraction, as `sql/tiles/located` does."""
-    x = (0.0 if lon_deg == 180.0 else lon_deg + 180.0) / 360.0 * side  # noqa: PLR2004  (180 is -180)
-    sine = math.sin(math.radians(lat_deg))
-    return x, (0.5 - math.log((1.0 + sine) / (1.0 - sine)) / (4.0 * math.pi)) * side
+@kernel
+def places(lon_deg: Floats, lat_deg: Floats, side: int) -> tuple[Floats, Floats]:
+    """Return column and row of the cell of each position, with the fraction, as `sql/tiles/located` does."""
+    x, y = np.empty(lon_deg.size), np.empty(lon_deg.size)
+    for i in range(lon_deg.size):
+        x[i] = (0.0 if lon_deg[i] == 180.0 else lon_deg[i] + 180.0) / 360.0 * side  # noqa: PLR2004  (180 is -180)
+        sine = math.sin(math.radians(lat_deg[i]))
+        y[i] = (0.5 - math.log((1.0 + sine) / (1.0 - sine)) / (4.0 * math.pi)) * side
+    return x, y
+
+
+@kernel
+def _find_all(slots: Ints, run: Ints, x: Floats, y: Floats) -> Ints:
+    """Return the readers of the cell of each position, -1 if there are none."""
+    found = np.empty(run.size, np.int64)
+    for i in range(run.size):
+        key = cell_key(run[i], math.floor(x[i]), math.floor(y[i]))
+        found[i] = _find(slots, key)
+        if found[i] == EMPTY:
+            found[i] = _find_beside(slots, key, x[i], y[i])
+    return found
 
 
 @kernel
@@ -143,19 +158,17 @@ def deal(run: Ints, lon_deg: Floats, lat_deg: Floats, readers: Readers, n_batche
     Detection and reader of every copy, in the order of the detections, and (n_batches + 1,) where each batch starts
     when they are sorted by batch.
     """
+    # One loop after the other: where a branch is guessed wrong, what was begun of the next rows is lost.
+    x, y = places(lon_deg, lat_deg, readers.side)
+    found = _find_all(readers.slots, run, x, y)
     row, reader = np.empty(run.size * readers.most, np.int32), np.empty(run.size * readers.most, np.int32)
     start = np.zeros(n_batches + 1, np.int64)
     n = 0
     for i in range(run.size):
-        x, y = place(lon_deg[i], lat_deg[i], readers.side)
-        key = cell_key(run[i], math.floor(x), math.floor(y))
-        found = _find(readers.slots, key)
-        if found == EMPTY:
-            found = _find_beside(readers.slots, key, x, y)
-        count = max(found, 0) & ((1 << _COUNT_BITS) - 1)
-        for r in range(found >> _COUNT_BITS, (found >> _COUNT_BITS) + count):
+        first, count = found[i] >> _COUNT_BITS, max(found[i], 0) & ((1 << _COUNT_BITS) - 1)
+        for r in range(first, first + count):
             one = readers.reader[r]
-            if one.is_owned or (one.west <= x <= one.east and one.north <= y <= one.south):
+            if one.is_owned or (one.west <= x[i] <= one.east and one.north <= y[i] <= one.south):
                 row[n], reader[n] = i, r
                 n += 1
                 start[one.batch + 1] += 1

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geofleet.algorithms.compiled import kernel
-from geofleet.algorithms.dealing import CELL_BITS, EMPTY, cell_key, place, slot_of
+from geofleet.algorithms.dealing import CELL_BITS, EMPTY, cell_key, places, slot_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -100,9 +100,10 @@ class CellCounts:
 
     def add(self, run: Codes, lon_deg: Floats, lat_deg: Floats) -> None:
         """Count detections; `run` is the number of the run of each."""
+        x, y = places(lon_deg, lat_deg, self._side)
         done = 0
         while done < run.size:
-            done, self._n_cells = _count(self._slots, self._n_cells, run, lon_deg, lat_deg, self._side, done)
+            done, self._n_cells = _count(self._slots, self._n_cells, run, x, y, done)
             if done < run.size:
                 self._slots = _grown(self._slots)
 
@@ -117,15 +118,14 @@ class CellCounts:
 
 @kernel
 def _count(  # noqa: PLR0917  (numba inlines no keyword-only arguments)
-    slots: Ints, n_cells: int, run: Codes, lon_deg: Floats, lat_deg: Floats, side: int, begin: int
+    slots: Ints, n_cells: int, run: Codes, x: Floats, y: Floats, begin: int
 ) -> tuple[int, int]:
     """Count from row `begin` on until the table is half full; return the first row not counted, and the cells found."""
     mask = len(slots) - 1
     for i in range(begin, run.size):
         if 2 * n_cells > mask:
             return i, n_cells
-        x, y = place(lon_deg[i], lat_deg[i], side)
-        key = cell_key(run[i], math.floor(x), math.floor(y))
+        key = cell_key(run[i], math.floor(x[i]), math.floor(y[i]))
         slot = slot_of(key, mask)
         while slots[slot, 0] != key and slots[slot, 0] != EMPTY:
             slot = (slot + 1) & mask
