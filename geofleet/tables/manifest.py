@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+from functools import cache
 from importlib import metadata
 from threading import Thread
 from typing import TYPE_CHECKING, Any
@@ -48,11 +49,16 @@ def write_manifest(
         "config_digest": config_digest,
         "settings": dict(settings or {}),
         "counts": dict(counts or {}),
-        "versions": {"python": platform.python_version(), **{name: metadata.version(name) for name in _PACKAGES}},
+        "versions": _versions(),
     }
     with atomic_path(path) as draft:
         draft.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n", encoding="utf-8")
     return path
+
+
+@cache
+def _versions() -> dict[str, str]:
+    return {"python": platform.python_version(), **{name: metadata.version(name) for name in _PACKAGES}}
 
 
 class Hashing:

@@ -112,16 +112,13 @@ def stage_detections(
     found = judged(connection)
     batch_rows = max(batch_rows, found.n_detections // MAX_BATCHES)
     bias = correct_passes(connection, detections, passes) if correct_bias else None
-    if bias is None:
-        create_view(connection, "aggregate/placed")
-    if n_vehicles:
-        create_view(connection, "aggregate/chosen")
-    else:
-        connection.table("placed").create_view("chosen")
     classes = plain.classes if plain else _number_classes(connection)
     if plain and not n_vehicles:
         keep_table(connection, plain.counts, "counts")
     else:
+        if bias is None:
+            create_view(connection, "aggregate/placed")
+        _choose(connection, n_vehicles)
         materialise(connection, "tiles/counts", {"fine_zoom": fine_zoom})
     materialise(connection, "tiles/leaves", {"zoom": zoom, "fine_zoom": fine_zoom, "batch_rows": batch_rows})
     materialise(connection, "tiles/assign", {"batch_rows": batch_rows})
@@ -158,7 +155,9 @@ def judge_detections(
 ) -> Survey | None:
     """Make the views and tables `judged`, `reporting`, `copies`, `fleet`, `passes` and `usable` of the detections.
 
-    With `fine_zoom`, return what a plain table holds, counted in cells of that zoom, unless there are limits.
+    With `fine_zoom`, return what a plain table holds, counted in cells of that zoom, unless there are limits. All of
+    such a table is usable; where all vehicles are used too, nobody asks for the views `judged` and `usable`, and they
+    are not made.
 
     Raises
     ------
@@ -166,9 +165,11 @@ def judge_detections(
         The table cannot be read, or a column is missing or mistyped.
     """
     bind_table(connection, DETECTIONS, detections, is_filled=True)
-    _bind_limits(connection, limits)
-    create_view(connection, "aggregate/judged")
     plain = survey(detections, fine_zoom) if fine_zoom and limits == ANYTHING else None
+    are_asked_for = not plain or n_vehicles
+    if are_asked_for:
+        _bind_limits(connection, limits)
+        create_view(connection, "aggregate/judged")
     if plain:
         keep_table(connection, plain.reporting, "reporting")
     else:
@@ -177,7 +178,8 @@ def judge_detections(
     _find_copies(connection)
     materialise(connection, "aggregate/fleet", {"n_vehicles": n_vehicles})
     materialise(connection, "aggregate/passes")
-    _select_usable(connection)
+    if are_asked_for:
+        _select_usable(connection)
     return plain
 
 
@@ -232,6 +234,14 @@ def _find_copies(connection: duckdb.DuckDBPyConnection) -> None:
         materialise(connection, "aggregate/copies")
     else:
         make_empty(connection, "aggregate/copies")
+
+
+def _choose(connection: duckdb.DuckDBPyConnection, n_vehicles: int) -> None:
+    """Make the view `chosen`: what `sql/aggregate/chosen` says or, where all vehicles are used, plainly all of them."""
+    if n_vehicles:
+        create_view(connection, "aggregate/chosen")
+    else:
+        connection.table("placed").create_view("chosen")
 
 
 def _number_classes(connection: duckdb.DuckDBPyConnection) -> tuple[str, ...]:
