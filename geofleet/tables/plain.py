@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     Pass = tuple[str, str, str]  # run, vehicle, pass
 
 MAX_ID_BITS = 1 << 29  # 64 MB of track ids
-BLOCK_ROWS = 250_000  # rows that are read at a time
+BLOCK_ROWS = 125_000  # rows that are read at a time
+_LEAST_BLOCKS = 16  # of a table: what is done with a block waits for the first, and goes on after the last is read
 _PASS = ("run_id", "vehicle_id", "pass_id")
 _PLACE = (f"{BBOX}.xmin", f"{BBOX}.ymin")
 _NUMBERS = ("n_frames", "sigma_e_m", "sigma_n_m", "class_confidence", "t_first", "t_last")
@@ -135,8 +136,9 @@ def _blocks(path: Path, columns: tuple[str, ...]) -> Iterator[pa.RecordBatch]:
     """Yield the named columns and the texts; each block lies in one row group, so that it has one dictionary a text."""
     texts = [*_PASS, "sign_class"]
     with pq.ParquetFile(path, read_dictionary=texts) as file:
+        n_rows = min(BLOCK_ROWS, file.metadata.num_rows // _LEAST_BLOCKS + 1)
         for group in range(file.num_row_groups):
-            yield from file.iter_batches(BLOCK_ROWS, [group], [*texts, *columns], use_threads=False)
+            yield from file.iter_batches(n_rows, [group], [*texts, *columns], use_threads=False)
 
 
 def _coded(column: pa.DictionaryArray, codes: dict[str, int]) -> Codes:

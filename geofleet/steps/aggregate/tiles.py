@@ -70,6 +70,7 @@ def cluster_tiles_of(
     """Return the clusters of all batches, and those that cross their tiles."""
     tasks = _tile_tasks(staged, settings)
     results = list(run_tasks(cluster_batch, tasks, n_workers=n_workers, progress=progress))
+    release_memory()
     crossing = fuse_open([r.open_rows for r in results], splitter(tasks[0]) if tasks else None)
     clusters = concatenate([*(r.clusters for r in results), crossing])
     release_memory()
