@@ -155,7 +155,7 @@ class SignRows:
         valid = nodes[_is_valid(nodes)]
         new = np.diff(valid["node_id"], prepend=valid["node_id"][:1] - 1) != 0
         kept = valid[new]
-        once: Nodes = kept[~np.isin(kept["node_id"], twice)]
+        once: Nodes = kept[~_is_among(kept["node_id"], twice)]
         for reason, before, after in ((INVALID, nodes, valid), (AGAIN, valid, kept), (TWICE, kept, once)):
             if len(after) < len(before):
                 self.skipped[reason] = self.skipped.get(reason, 0) + len(before) - len(after)
@@ -208,8 +208,15 @@ def _is_valid(nodes: Nodes) -> NDArray[np.bool_]:
     return np.asarray((np.abs(nodes["lon_e7"]) <= _MAX_E7[0]) & (np.abs(nodes["lat_e7"]) <= _MAX_E7[1]), bool)
 
 
+def _is_among(number: Ints, ascending: Ints) -> NDArray[np.bool_]:
+    """Do as `np.isin`, which imports numpy.ma."""
+    if not len(ascending):
+        return np.zeros(len(number), bool)
+    return np.asarray(ascending[np.searchsorted(ascending[:-1], number)] == number, bool)
+
+
 def _mapped_twice(spool: NodeSpool, tags: TagSigns) -> Ints:
-    """Return the nodes that are a road's `highway=stop|give_way` point whose sign is mapped beside the road as well."""
+    """Return the nodes that are a road's `highway=stop|give_way` point whose sign is mapped beside it, ascending."""
     twice = []
     for concept in ("stop", "yield"):
         parts: dict[bool, list[Nodes]] = {True: [], False: []}
@@ -220,7 +227,7 @@ def _mapped_twice(spool: NodeSpool, tags: TagSigns) -> Ints:
         if parts[True] and parts[False]:
             plates, points = (np.concatenate(parts[own]) for own in (True, False))
             twice.append(points["node_id"][_is_beside(points, plates)])
-    return np.concatenate([np.zeros(0, np.int64), *twice])
+    return np.sort(np.concatenate([np.zeros(0, np.int64), *twice]))
 
 
 def _is_beside(points: Nodes, plates: Nodes) -> NDArray[np.bool_]:

@@ -46,27 +46,35 @@ class PlaceCheck:
 
     def __init__(self, where: str) -> None:
         self._where = where
-        self._n: Counter[str] = Counter()
-        self._outside: Counter[str] = Counter()
-        self._swapped: Counter[str] = Counter()
+        self._n_all = self._n_guinea = 0
+        self._in_cell: dict[str | None, Counter[int]] = {}
 
     def add(self, lon: Floats, lat: Floats, country: str | None) -> None:
         """Look at valid positions of signs of one country, None where it is not known."""
         if not len(lon):
             return
-        sea = (np.abs(lon) < _EMPTY_SEA_DEG) & (np.abs(lat) < _EMPTY_SEA_DEG)
+        self._n_all += len(lon)
+        self._n_guinea += int(((np.abs(lon) < _EMPTY_SEA_DEG) & (np.abs(lat) < _EMPTY_SEA_DEG)).sum())
         column, row = (np.floor(side / _CELL_DEG).astype(np.int64) for side in (lon, lat))
         every = np.sort((column << _ROW_BITS) + row + _ROW_OFFSET)  # np.unique imports numpy.ma
         first = np.flatnonzero(np.diff(every, prepend=every[0] - 1))
-        cells, in_cell = every[first], np.diff(first, append=len(every))
-        x = np.asarray((cells >> _ROW_BITS) + 0.5, np.float64) * _CELL_DEG
-        y = np.asarray((cells & ((1 << _ROW_BITS) - 1)) - _ROW_OFFSET + 0.5, np.float64) * _CELL_DEG
-        self._n["all"] += len(lon)
-        self._n["guinea"] += int(sea.sum())
-        self._n["no land"] += int(in_cell[~_is_on_land(x, y)].sum())
-        if country in outlines():
-            self._outside[country] += int(in_cell[~is_within(country, x, y)].sum())
-            self._swapped[country] += int(in_cell[is_within(country, y, x)].sum())
+        n_each = np.diff(first, append=len(every))
+        counts = self._in_cell.setdefault(country, Counter())
+        counts.update(dict(zip(every[first].tolist(), n_each.tolist(), strict=True)))
+
+    def _counted(self) -> tuple[int, Counter[str], int]:
+        """Return how many points lie on no land, outside of their country, and inside with the axes exchanged."""
+        n_sea = n_swapped = 0
+        outside: Counter[str] = Counter()
+        for country, counts in self._in_cell.items():
+            cells, in_cell = (np.fromiter(side, np.int64) for side in (counts.keys(), counts.values()))
+            x = np.asarray((cells >> _ROW_BITS) + 0.5, np.float64) * _CELL_DEG
+            y = np.asarray((cells & ((1 << _ROW_BITS) - 1)) - _ROW_OFFSET + 0.5, np.float64) * _CELL_DEG
+            n_sea += int(in_cell[~_is_on_land(x, y)].sum())
+            if country in outlines():
+                outside[country] = int(in_cell[~is_within(country, x, y)].sum())
+                n_swapped += int(in_cell[is_within(country, y, x)].sum())
+        return n_sea, outside, n_swapped
 
     def doubts(self) -> dict[str, int]:
         """Return what can hardly be true, with counts.
@@ -76,19 +84,20 @@ class PlaceCheck:
         InputError
             Most points lie in the Gulf of Guinea; or outside of the country, and inside with the axes exchanged.
         """
-        n_all, n_outside = self._n["all"], self._outside.total()
-        if 2 * self._n["guinea"] > n_all:
-            raise _guinea(self._n["guinea"], n_all, self._where)
-        lands = ", ".join(country for country, n in self._outside.items() if n)
-        if 2 * n_outside > n_all and 2 * self._swapped.total() > n_all:
+        if 2 * self._n_guinea > self._n_all:
+            raise _guinea(self._n_guinea, self._n_all, self._where)
+        n_sea, outside, n_swapped = self._counted()
+        n_outside = outside.total()
+        lands = ", ".join(country for country, n in outside.items() if n)
+        if 2 * n_outside > self._n_all and 2 * n_swapped > self._n_all:
             raise InputError(
-                f"{n_outside} of {n_all} positions lie outside of {lands}, and inside with the axes swapped.",
+                f"{n_outside} of {self._n_all} positions lie outside of {lands}, and inside with the axes swapped.",
                 where=self._where,
                 todo="Latitude and longitude are exchanged: swap them (swap_xy), or name the right x and y columns.",
             )
         found = {f"{SUSPICIOUS}outside of {lands}; is the CRS right?": n_outside} if n_outside else {}
-        if 2 * self._n["no land"] > n_all:
-            found[f"{SUSPICIOUS}over 30 km from any land; is the CRS right?"] = self._n["no land"]
+        if 2 * n_sea > self._n_all:
+            found[f"{SUSPICIOUS}over 30 km from any land; is the CRS right?"] = n_sea
         return found
 
 
