@@ -123,5 +123,9 @@ def settle(scenario: str | Path, settings: list[str] | None, **options: Any) -> 
 
 
 def spare_memory() -> None:
-    """Have Arrow give back what it is done with: a table that is written in pieces then needs 40 MB less."""
+    """Have Arrow give back what it is done with: a table that is written in pieces then needs 40 MB less.
+
+    And have numpy start no threads for linear algebra, which maps do without; they spin while the rest is imported.
+    """
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

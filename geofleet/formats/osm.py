@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from geofleet.formats.osm_road_scan import read_roads
 from geofleet.formats.osm_rows import EDGE, SignRows
 from geofleet.formats.osm_scan import detect, refuse_lanelet2, scan, sign_nodes
 from geofleet.formats.reading import LayerRead, LayerStream
@@ -13,6 +12,8 @@ from geofleet.tables.store import build_table
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from geofleet.formats.osm_roads import Roads
 
 __all__ = ["FORMAT", "detect", "read_lanes", "read_signs"]
 
@@ -37,7 +38,7 @@ def read_signs(path: Path, *, roads: bool = True) -> LayerStream:
     InputError
         The file is missing, empty, damaged or not OpenStreetMap's.
     """
-    nodes, ways = scan(path, lambda pbf: (sign_nodes(pbf), read_roads(pbf) if roads else None))
+    nodes, ways = scan(path, lambda pbf: (sign_nodes(pbf), _roads(pbf) if roads else None))
     if not nodes.spool.n_nodes:
         refuse_lanelet2(path)
     rows = SignRows(nodes, path=path, roads=ways)
@@ -52,7 +53,7 @@ def read_lanes(path: Path) -> LayerRead:
     InputError
         The file is missing, empty, damaged or not OpenStreetMap's.
     """
-    ways = scan(path, read_roads)
+    ways = scan(path, _roads)
     if not len(ways.way_id):
         refuse_lanelet2(path)
     columns = {
@@ -63,3 +64,9 @@ def read_lanes(path: Path) -> LayerRead:
         "source": path.name,
     }
     return LayerRead(build_table(LANES, columns, ways.lines()), FORMAT, {}, {EDGE: ways.n_missing_nodes})
+
+
+def _roads(pbf: Path) -> Roads:
+    from geofleet.formats.osm_road_scan import read_roads  # noqa: PLC0415  (not needed without roads)
+
+    return read_roads(pbf)

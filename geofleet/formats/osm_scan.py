@@ -18,7 +18,6 @@ import numpy as np
 
 from geofleet.errors import InputError
 from geofleet.formats import osm_json
-from geofleet.formats.osm_copy import copy_as_pbf
 from geofleet.formats.osm_dense import DenseNodes
 from geofleet.formats.osm_pbf import UnusualPbfError, read_blocks
 from geofleet.formats.osm_spool import NODE, NodeSpool
@@ -121,6 +120,8 @@ def scan(path: Path, work: Callable[[Path], _T]) -> _T:
                 return work(path)
             except UnusualPbfError:
                 pass  # libosmium reads it, and writes what is read here
+        from geofleet.formats.osm_copy import copy_as_pbf  # noqa: PLC0415  (PBF does without)
+
         with tempfile.TemporaryDirectory(prefix="geofleet-") as folder:
             copy = Path(folder) / "map.osm.pbf"
             copy_as_pbf(path, found, copy)
