@@ -1,10 +1,12 @@
 """Codes against what the public lists say: those that were once wrong, and their neighbours.
 
 Vienna: annex 1 of the Convention on Road Signs and Signals as amended in 1995. France: the order of 24 November 1967.
-Belgium: the royal order of 1 December 1975. United States: tables 2B-1, 2C-1, 2I-1, 7B-1, 8B-1 and 9A-1 of the MUTCD of
-2023, figure 2B-4 of that of 2009. The Netherlands: annex 1 of the RVV 1990. Switzerland: annex 2 of the SSV. Finland:
-annex 3 of the Road Traffic Act 729/2018, and the decree 182/1982 that it took the place of, as the Finnish road agency
-lists them. OpenStreetMap: the words of its wiki's page on `traffic_sign`.
+Belgium: the royal order of 1 December 1975. United States: tables 2B-1, 2C-1, 2I-1, 7B-1, 8B-1 and 9A-1 of the MUTCD
+of 2023, figure 2B-4 of that of 2009. The Netherlands: annex 1 of the RVV 1990. Switzerland: annex 2 of the SSV.
+Austria: sections 50 to 54 of the StVO 1960, and Poland: the regulation of 31 July 2002, as OpenStreetMap lists their
+signs. Germany: the StVO as amended in 2020 and the VzKat of 2017. Finland: annex 3 of the Road Traffic Act 729/2018,
+and the decree 182/1982 that it took the place of, as the Finnish road agency lists them. OpenStreetMap: the words of
+its wiki's page on `traffic_sign`.
 """
 
 from __future__ import annotations
@@ -52,6 +54,36 @@ BELGIUM = {
     "F39": "direction_sign", "F47": "end_road_works", "F50bis": "bicycle_crossing", "F59": "parking", "F62": "service",
     "F81": "lanes_merge", "F85": "two_way_traffic", "F91": "lane_arrangement", "F95": "escape_lane",
     "F98": "emergency_bay",
+}  # fmt: skip
+AUSTRIA = {
+    "50.2a": "curve_right", "50.2b": "curve_left", "50.2c": "double_curve_right", "50.2d": "double_curve_left",
+    "50.4": "priority_at_next", "50.6c-1l": "level_crossing_approach", "50.7": "steep_descent", "50.7a": "steep_ascent",
+    "50.8b": "road_narrows_left", "50.8c": "road_narrows_right", "50.10a": "crosswind", "50.10b": "falling_rocks",
+    "50.10c": "aircraft", "50.13a": "domestic_animals", "50.13b": "wild_animals", "52.3a": "no_left_turn",
+    "52.3b": "no_right_turn", "52.6a": "no_cars", "52.6b": "no_motorcycles", "52.6c": "no_motor_vehicles",
+    "52.7c": "no_animal_carts", "52.7d": "no_dangerous_goods", "52.8a": "no_bicycles_mopeds", "52.8b": "no_mopeds",
+    "52.8c": "no_bicycles", "52.13c-a": "alternate_parking", "52.14": "no_horn", "52.14a": "no_riding",
+    "52.14b": "no_pedestrians", "52.16a": "end_cycleway", "52.17c": "end_footway", "52.17a-b": "segregated_path",
+    "52.19a": "end_minimum_speed", "52.21": "u_turn_only", "52.22": "snow_chains", "53.2c": "pedestrian_crossing",
+    "53.7a": "priority_over_oncoming", "53.13b": "direction_sign", "53.24": "buses_only", "53.26": "cycle_street",
+    "53.27": "cycleway", "53.28a": "shared_path", "53.28b": "segregated_path",
+}  # fmt: skip
+POLAND = {
+    "A-1": "curve_right", "A-3": "double_curve_right", "A-6b": "side_road", "A-9": "level_crossing_gated",
+    "A-12b": "road_narrows_right", "A-22": "steep_descent", "A-27": "quay", "B-3": "no_cars",
+    "B-3/4": "no_motor_vehicles", "B-3-4-10": "no_motor_vehicles", "B-6-8": "no_tractors", "B-12": "no_handcarts",
+    "B-13": "no_explosives", "B-13a": "no_dangerous_goods", "B-19": "axle_load_limit", "B-20": "stop",
+    "B-21": "no_left_turn", "B-32": "customs_stop", "B-32a": "checkpoint_stop", "B-37": "alternate_parking",
+    "B-42": "end_all_restrictions", "C-1": "turn_right_here", "C-2": "turn_right_ahead", "C-13-16": "shared_path",
+    "D-5": "priority_over_oncoming", "D-11": "bus_lane", "D-13": "lane_arrangement", "D-14": "lane_arrangement",
+    "D-44": "parking_zone", "D-46": "internal_road", "D-47": "end_internal_road", "D-52": "traffic_zone",
+    "D-53": "end_traffic_zone", "D-54": "environmental_zone", "D-55": "end_environmental_zone",
+}  # fmt: skip
+GERMANY = {
+    "277": "no_overtaking_trucks", "277.1": "no_overtaking_two_wheelers", "281.1": "end_no_overtaking_two_wheelers",
+    "223.1": "lane_use", "223.3-51": "lane_use", "342": "wait_line", "350.1": "cycle_highway",
+    "350.2": "end_cycle_highway", "354": "water_protection_area", "359": "service", "264": "width_limit",
+    "265-3,8": "height_limit", "525-31": "lane_arrangement",
 }  # fmt: skip
 UNITED_STATES = {
     "R3-1": "no_right_turn",
@@ -253,6 +285,9 @@ CASES = [
         ("fr", "FR", FRANCE),
         ("be", "BE", BELGIUM),
         ("mutcd", "US", UNITED_STATES),
+        ("stvo-at", "AT", AUSTRIA),
+        ("pl", "PL", POLAND),
+        ("stvo", "DE", GERMANY),
         ("rvv", "NL", NETHERLANDS),
         ("ssv", "CH", SWITZERLAND),
         ("", "FI", FINLAND_2020),
@@ -268,7 +303,22 @@ def test_a_code_means_what_the_list_says(scheme, country, code, concept):
     assert load_taxonomy().meaning(code, country=country, scheme=scheme).concept == concept
 
 
-@pytest.mark.parametrize(("scheme", "code"), [("vienna", "D,10a"), ("be", "D8"), ("be", "D6"), ("be", "A18")])
+@pytest.mark.parametrize(
+    ("scheme", "code"),
+    [
+        ("vienna", "D,10a"),
+        ("be", "D8"),
+        ("be", "D6"),
+        ("be", "A18"),
+        ("stvo-at", "50.7b"),
+        ("stvo-at", "52.15a"),
+        ("stvo-at", "52.22a"),
+        ("stvo-at", "53.12"),
+        ("pl", "D-20"),
+        ("pl", "D-51b"),
+        ("pl", "A-T-1"),
+    ],
+)
 def test_what_is_no_such_sign_is_not_known(scheme, code):
     assert not load_taxonomy().meaning(code, scheme=scheme).known
 
