@@ -15,6 +15,8 @@ from geofleet.tables.database import load_sql, sql_folder
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from geofleet.tables.database import Parameter
+
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 METRICS = (
     "gospa_m",
@@ -48,17 +50,26 @@ def statements(folder: str) -> str:
     for path in sorted((sql_folder() / folder).glob("*.sql")):
         statement = load_sql(f"{folder}/{path.stem}")
         columns = ", ".join(f"`{name}`" for name, _ in statement.writes)
-        lines = [f"- reads: {', '.join(f'`{name}`' for name in statement.reads)}", f"- gives: {columns}"]
+        reads = ", ".join(f"`{name}`" for name in statement.reads) or "nothing"
+        lines = [f"- reads: {reads}", f"- gives: {columns}"]
         if statement.params:
-            lines.insert(1, f"- parameters: {', '.join(f'`${name}`' for name in statement.params)}")
+            lines.insert(1, f"- parameters: {', '.join(_parameter(*item) for item in statement.declared.items())}")
         sections.append(f"### `sql/{folder}/{path.name}`\n\n{statement.why}\n\n" + "\n".join(lines))
     return "\n\n".join(sections)
+
+
+def _parameter(name: str, parameter: Parameter) -> str:
+    default = f"; {parameter.default} if not given" if parameter.default else ""
+    return f"`${name}` ({parameter.kind}, {parameter.meaning}{default})"
 
 
 PARTS: dict[str, dict[str, Callable[[], str]]] = {
     "evaluation.md": {"metrics": metrics},
     "sql.md": {
         "analysis": lambda: statements("analysis"),
+        "checks": lambda: statements("checks"),
+        "tiles": lambda: statements("tiles"),
+        "aggregate": lambda: statements("aggregate"),
         "evaluate": lambda: statements("evaluate"),
     },
 }

@@ -91,6 +91,15 @@ def parse_area(text: str | None) -> tuple[float, float, float, float] | None:
     return west, south, east, north
 
 
+def parse_params(given: list[str] | None) -> dict[str, str]:
+    """Read `key=value` of every --param."""
+    pairs = [one.partition("=") for one in given or []]
+    for key, equals, value in pairs:
+        if not (key and equals):
+            raise ConfigError(f"{key + value!r} is not key=value.", where="--param", todo="Example: --param zoom=16")
+    return {key.strip(): value.strip() for key, _, value in pairs}
+
+
 def parse_shift(text: str) -> tuple[float, float]:
     """Read `E,N`, metres."""
     try:

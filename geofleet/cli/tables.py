@@ -21,6 +21,7 @@ from geofleet.cli.options import (
     Utm,
     parse_columns,
     parse_origin,
+    parse_params,
     parse_utm,
 )
 from geofleet.cli.output import print_json, print_result, print_table
@@ -32,15 +33,25 @@ app = typer.Typer(rich_markup_mode=None)
 def sql(
     query: Annotated[str, typer.Argument(help="A statement, or the path of a .sql file.")],
     data: Annotated[Path, typer.Option("--data", help="Folder with tables.")] = Path("data/processed"),
+    param: Annotated[
+        list[str] | None, typer.Option("--param", help="A parameter of a .sql file; repeatable.", metavar="KEY=VALUE")
+    ] = None,
+    show_sql: Annotated[
+        bool, typer.Option("--show-sql", help="Print it as a script for DuckDB's own shell, run nothing.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Query tables with DuckDB's spatial SQL. Each table below a folder is a view of its name.
 
     Example: geofleet sql "SELECT concept, count(*) AS n FROM signs GROUP BY concept ORDER BY n DESC"
     """
-    from geofleet.workflows.query import query as workflow
+    from geofleet.workflows import query as workflow
 
-    names, rows = workflow(query, data)
+    params = parse_params(param)
+    if show_sql:
+        typer.echo(workflow.show_sql(query, data, params), nl=False)
+        return
+    names, rows = workflow.query(query, data, params)
     if as_json:
         print_json([dict(zip(names, row, strict=True)) for row in rows])
     else:

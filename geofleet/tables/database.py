@@ -10,7 +10,7 @@ import os
 import re
 import tempfile
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,16 @@ if TYPE_CHECKING:
 
 _HEADER = re.compile(r"^--\s*(why|reads|params|writes):\s*(.*)$")
 _PARAMETER = re.compile(r"\$([a-z_]\w*)")
+_DECLARED = re.compile(r"\$([a-z_]\w*)\s*\((\w+),?\s*([^()]*?)(?:;\s*(\S+) if not given)?\)")
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A parameter as a header declares it: type, meaning, and the text of its default, None where it must be given."""
+
+    kind: str
+    meaning: str
+    default: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +49,7 @@ class Statement:
     reads: tuple[str, ...]
     params: tuple[str, ...]
     writes: tuple[tuple[str, str], ...]
+    declared: Mapping[str, Parameter] = field(default_factory=dict)
 
 
 def connect(
@@ -114,6 +125,17 @@ def load_sql(name: str) -> Statement:
     path = sql_folder() / f"{name}.sql"
     if not path.is_file():
         raise QueryError(f"there is no statement {name!r}.", where=str(path))
+    return read_sql(path, name)
+
+
+def read_sql(path: Path, name: str) -> Statement:
+    """Read any file that is written like those of `sql/`; one without a header reads, takes and writes nothing known.
+
+    Raises
+    ------
+    QueryError
+        Its header does not name the parameters that its text uses.
+    """
     text = path.read_text(encoding="utf-8")
     header: dict[str, list[str]] = {"why": [], "reads": [], "params": [], "writes": []}
     current = ""
@@ -127,7 +149,8 @@ def load_sql(name: str) -> Statement:
             current = ""
             continue
         header[current].append(rest)
-    declared = set(_PARAMETER.findall(" ".join(header["params"])))
+    params = " ".join(header["params"])
+    declared = set(_PARAMETER.findall(params))
     body = "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("--"))
     used = set(_PARAMETER.findall(body))
     if declared != used:
@@ -140,6 +163,9 @@ def load_sql(name: str) -> Statement:
         reads=tuple(word.strip() for word in ",".join(header["reads"]).split(",") if word.strip() not in {"", "none"}),
         params=tuple(sorted(declared)),
         writes=_parse_columns(" ".join(header["writes"])),
+        declared={
+            key: Parameter(kind, meaning, default or None) for key, kind, meaning, default in _DECLARED.findall(params)
+        },
     )
 
 
@@ -186,16 +212,18 @@ def _naming(name: str) -> Iterator[None]:
 
 
 def _fill_in(text: str, given: Mapping[str, Any]) -> str:
-    """Write numbers and truth values into a statement; texts stay parameters.
+    """Write numbers, truth values and nulls into a statement; texts stay parameters.
 
     DuckDB's client imports pandas to look at a parameter, whatever it is: half a second and 60 MB for every step.
     """
-    literals = {key: _literal(value) for key, value in given.items() if isinstance(value, bool | int | float)}
+    literals = {key: _literal(value) for key, value in given.items() if not isinstance(value, str)}
     return _PARAMETER.sub(lambda match: literals.get(match[1], match[0]), text)
 
 
-def _literal(value: float) -> str:
+def _literal(value: float | None) -> str:
     """Return a number as SQL; one with a point would be a DECIMAL, with other rules of rounding."""
+    if value is None:
+        return "NULL"
     return f"'{value!r}'::DOUBLE" if isinstance(value, float) else f"({value})".lower()
 
 

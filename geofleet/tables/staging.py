@@ -185,15 +185,10 @@ def judge_detections(
 
 def _bind_limits(connection: duckdb.DuckDBPyConnection, limits: Limits) -> None:
     """Make the tables `area` and `unlisted`, empty where there is no such limit."""
-    if limits.area:
-        box = dict(zip(("west", "south", "east", "north"), map(float, limits.area), strict=True))
-        materialise(connection, "aggregate/area", box)
-    else:
-        make_empty(connection, "aggregate/area")
-    if limits.is_listed:
-        materialise(connection, "aggregate/unlisted", {"concepts": ",".join(load_taxonomy().concepts)})
-    else:
-        make_empty(connection, "aggregate/unlisted")
+    sides = limits.area or (None,) * 4
+    materialise(connection, "aggregate/area", dict(zip(("west", "south", "east", "north"), sides, strict=True)))
+    concepts = ",".join(load_taxonomy().concepts) if limits.is_listed else None
+    materialise(connection, "aggregate/unlisted", {"concepts": concepts})
 
 
 def _select_usable(connection: duckdb.DuckDBPyConnection) -> None:

@@ -3,8 +3,8 @@
 --      or two signs in one. Where half the tracks of a pass fit worse than declared, its sigmas are scaled up to them.
 --      P is the car's own declaration or else a weak one. Sums go in the order of the tracks: the same bits each time
 -- reads: @aggregate/solved, passes AS driven
--- params: $range_bias_sigma_m (double, metres, of cars that declare none),
---         $bearing_bias_sigma_deg (double, degrees, of cars that declare none)
+-- params: $range_bias_sigma_m (double, metres, of cars that declare none; 5 if not given),
+--         $bearing_bias_sigma_deg (double, degrees, of cars that declare none; 5 if not given)
 -- writes: run_id VARCHAR, pass_id VARCHAR, n_tracks BIGINT, scale DOUBLE, range_bias_m DOUBLE, bearing_bias_rad DOUBLE,
 --         var_rr DOUBLE, cov_rt DOUBLE, var_tt DOUBLE
 WITH scales AS (

@@ -1,6 +1,6 @@
 -- why: the vehicles used of every run: the first ones by id, so that a small fleet is part of every larger one
 -- reads: @aggregate/reporting
--- params: $n_vehicles (integer, vehicles a run; 0 = all)
+-- params: $n_vehicles (integer, vehicles a run, 0 for all; 0 if not given)
 -- writes: run_id VARCHAR, vehicle_id VARCHAR, n_reporting BIGINT
 SELECT
     run_id,

@@ -3,7 +3,8 @@
 --      detections are not scanned for each. Of one plain file `geofleet/tables/plain.py` says the same, and a test
 --      demands the same rows
 -- reads: @aggregate/judged
--- params: $low (bigint, smallest track id), $high (bigint, largest track id), $is_narrow (boolean, ids fit bit strings)
+-- params: $low (bigint, smallest track id; 0 if not given), $high (bigint, largest track id; 0 if not given),
+--         $is_narrow (boolean, ids fit bit strings; false if not given)
 -- writes: run_id VARCHAR, vehicle_id VARCHAR, pass_id VARCHAR, n_rows BIGINT, n_usable BIGINT, n_track_ids BIGINT
 SELECT
     run_id,

@@ -1,6 +1,6 @@
 -- why: the two ends of every match, to draw a line from a sign of the map to its reference sign
 -- reads: matches, signs
--- params: $min_length_m (double, metres: shorter lines are left out)
+-- params: $min_length_m (double, metres: shorter lines are left out; 0.002 if not given)
 -- writes: run_id VARCHAR, method VARCHAR, n_vehicles BIGINT, fused_id VARCHAR, ref_id VARCHAR, ref_class VARCHAR,
 --         distance_m DOUBLE, lon DOUBLE, lat DOUBLE, ref_lon DOUBLE, ref_lat DOUBLE
 SELECT

@@ -1,6 +1,6 @@
 -- why: every score from counts and sums of squared errors, in SQL alone: what `derive_scores` does in Python
 -- reads: @evaluate/counts
--- params: $gate_m (double, metres: c, the gate of the matching)
+-- params: $gate_m (double, metres: c, the gate of the matching; 2 if not given)
 -- writes: run_id VARCHAR, method VARCHAR, n_vehicles BIGINT, tile VARCHAR, concept VARCHAR, tp BIGINT, fp BIGINT,
 --         fn BIGINT, sum_sq_error_m2 DOUBLE, precision DOUBLE, recall DOUBLE, f1 DOUBLE, mse_m2 DOUBLE,
 --         rmse_m DOUBLE, gospa DOUBLE, gospa_m DOUBLE, null_reason VARCHAR, cardinality_m2 DOUBLE

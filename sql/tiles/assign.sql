@@ -1,7 +1,7 @@
 -- why: the tiles that own detections, with their counts, dealt into batches of neighbouring tiles (quadkeys sort along
 --      a space-filling curve); a batch ends before it exceeds $batch_rows by a tile
 -- reads: @tiles/leaves
--- params: $batch_rows (integer, detections a batch)
+-- params: $batch_rows (integer, detections a batch; 100000 if not given)
 -- writes: run_id VARCHAR, tile VARCHAR, n_points BIGINT, tile_code INTEGER, batch INTEGER
 WITH tiles AS (
     SELECT

@@ -1,7 +1,7 @@
 -- why: detections a cell of the finest grid; column and row are those of ST_QuadKey, as integers because a text a
 --      detection is slow. Of one plain file `geofleet/tables/plain.py` says the same, and a test demands the same rows
 -- reads: @aggregate/chosen
--- params: $fine_zoom (integer, zoom of the cells)
+-- params: $fine_zoom (integer, zoom of the cells; 18 if not given)
 -- writes: run_id VARCHAR, cell_x INTEGER, cell_y INTEGER, n_points BIGINT
 SELECT
     run_id,

@@ -1,7 +1,9 @@
 -- why: the tile of every cell: at $zoom, or where that owns more than $batch_rows detections the first deeper one that
 --      does not (a hot tile is split by quadkey depth, down to the cells themselves)
 -- reads: @tiles/counts
--- params: $zoom (integer, tile zoom), $fine_zoom (integer, zoom of the cells), $batch_rows (integer, detections)
+-- params: $zoom (integer, tile zoom; 14 if not given),
+--         $fine_zoom (integer, zoom of the cells; 18 if not given),
+--         $batch_rows (integer, detections; 100000 if not given)
 -- writes: run_id VARCHAR, cell_x INTEGER, cell_y INTEGER, n_points BIGINT, zoom INTEGER, tile VARCHAR
 WITH levels AS (
     SELECT

@@ -1,6 +1,6 @@
 -- why: every detection with its run and its place among the cells, as in tiles/counts
 -- reads: @aggregate/coded, @aggregate/passes
--- params: $fine_zoom (integer, zoom of the cells)
+-- params: $fine_zoom (integer, zoom of the cells; 18 if not given)
 -- writes: run_id VARCHAR, pass_code INTEGER, track_id BIGINT, class_code INTEGER, lon DOUBLE, lat DOUBLE, var_m2 DOUBLE,
 --         class_confidence DOUBLE, t_first_us BIGINT, t_last_us BIGINT, x DOUBLE, y DOUBLE
 SELECT

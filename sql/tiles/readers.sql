@@ -1,7 +1,9 @@
 -- why: the tiles that read each cell: the one that owns it, without bounds, and those around it, each with the box, in
 --      cells, whose detections lie in its halo
 -- reads: @tiles/leaves, @tiles/assign
--- params: $fine_zoom (integer, zoom of the cells), $halo_m (double, metres), $n_around (integer, cells to look around)
+-- params: $fine_zoom (integer, zoom of the cells; 18 if not given),
+--         $halo_m (double, metres; 8.008 if not given),
+--         $n_around (integer, cells to look around; 1 if not given)
 -- writes: run_id VARCHAR, cell_x INTEGER, cell_y INTEGER, tile_code INTEGER, batch INTEGER, is_owned BOOLEAN,
 --         west DOUBLE, east DOUBLE, north DOUBLE, south DOUBLE
 WITH placed AS (
