@@ -224,7 +224,7 @@ def _literal(value: float | None) -> str:
     """Return a number as SQL; one with a point would be a DECIMAL, with other rules of rounding."""
     if value is None:
         return "NULL"
-    return f"'{value!r}'::DOUBLE" if isinstance(value, float) else f"({value})".lower()
+    return f"'{float(value)!r}'::DOUBLE" if isinstance(value, float) else f"({value})".lower()
 
 
 def create_view(connection: duckdb.DuckDBPyConnection, name: str, *, alias: str = "") -> None:

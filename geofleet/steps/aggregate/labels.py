@@ -63,7 +63,7 @@ def check_area(area: tuple[float, float, float, float] | None) -> tuple[float, f
             where="--area",
             todo="Give W,S,E,N, e.g. --area 24.93,60.16,24.96,60.18",
         )
-    return area
+    return float(west), float(south), float(east), float(north)
 
 
 def _clustering(settings: AggregateConfig) -> str:
