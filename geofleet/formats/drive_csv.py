@@ -103,6 +103,13 @@ def read_epochs(
     refuse_long_lines(path)
     layout, local, notes = _settled(path, columns, crs, origin, utm)
     frame, n_broken = _read(path, layout)
+    lost = sorted(set(layout.columns.values()) - set(frame.columns))
+    if lost:
+        raise InputError(
+            f"the line of names cannot be read: {', '.join(lost)[:100]} is lost.",
+            where=str(path),
+            todo="Look at the quotes in it.",
+        )
     x, y, made_of = _coordinates(frame, layout, local)
     has_heights = not any(what.startswith(SCALED[:20]) for what in made_of)  # they may be in any unit then
     z = _numbers(frame, layout.columns.get("height") if has_heights else None)

@@ -77,7 +77,10 @@ def read_epochs(path: Path) -> tuple[dict[str, Epochs], dict[str, int], dict[str
     chosen = is_line if is_line.sum() >= is_point.sum() or not _time_of(features.table) else is_point
     rows = np.flatnonzero(chosen)
     read = _of_lines if chosen is is_line else _of_points
-    vertices = read(features.table.take(rows), geometry[rows])
+    try:
+        vertices = read(features.table.take(rows), geometry[rows])
+    except UnicodeDecodeError:
+        raise InputError("a text that is not UTF-8.", where=str(path), todo="Export it again.") from None
     crs = features.crs or CRS84
     lon, lat = to_lonlat(vertices.x, vertices.y, crs, where=str(path))
     epochs = Epochs.of(lon, lat, t_utc=vertices.t_utc, elapsed_s=vertices.elapsed_s, part=vertices.part)

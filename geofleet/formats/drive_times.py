@@ -11,7 +11,7 @@ import pyarrow as pa
 from pyproj import Geod
 
 from geofleet.formats.drive_dates import CLOCK, COMPACT, COMPACT_CLOCK, EXCEL_DAYS, clock_seconds, parse_dates
-from geofleet.formats.gnss_time import GPS_EPOCH, gpst_to_utc, microseconds
+from geofleet.formats.gnss_time import GPS_EPOCH, LONGEST_S, gpst_to_utc, microseconds
 from geofleet.formats.inventory_columns import parse_numbers
 
 if TYPE_CHECKING:
@@ -85,7 +85,8 @@ def times_of(text: pd.Series[str], time_format: str, *, day_first: bool | None =
         return np.asarray(_UNIX_EPOCH + microseconds(number * _UNIX[time_format])), None
     if time_format == EXCEL:
         return np.asarray(_EXCEL_EPOCH + microseconds(number * _DAY_S)), None
-    return nothing, number * _RELATIVE.get(time_format, 1.0)
+    seconds = number * _RELATIVE.get(time_format, 1.0)
+    return nothing, np.where(np.abs(seconds) < LONGEST_S, seconds, np.nan)
 
 
 def unit_by_speed(seconds: Floats, lon: Floats, lat: Floats) -> str:

@@ -16,7 +16,7 @@ GPS_EPOCH = np.datetime64("1980-01-06", "us")
 WEEK_S = 604_800.0
 ROLLOVER_WEEKS = 1024
 _RECENT_WEEKS = 2048  # the count of ten bits began again on 2019-04-07
-_LONGEST_S = 1e11  # three thousand years; what is longer is no time
+LONGEST_S = 1e11  # three thousand years; what is longer is no time
 
 # Days on which GPS time came to be one more second ahead of UTC (IERS Bulletin C)
 LEAP_DAYS = np.array(
@@ -41,13 +41,14 @@ def gps_week_time(week: Floats, of_week_s: Floats, *, near: np.datetime64 | None
 
     Weeks of ten bits are completed: to the date nearest to `near`, else to the time since 2019.
     """
-    whole = week + _rollovers(week, near) * ROLLOVER_WEEKS
-    return np.asarray(GPS_EPOCH + microseconds(whole * WEEK_S) + microseconds(of_week_s))
+    with np.errstate(over="ignore"):  # of a number that is no week
+        whole_s = (week + _rollovers(week, near) * ROLLOVER_WEEKS) * WEEK_S
+    return np.asarray(GPS_EPOCH + microseconds(whole_s) + microseconds(of_week_s))
 
 
 def microseconds(seconds: Floats) -> NDArray[np.timedelta64]:
     """Return seconds as microseconds, NaT where they are NaN or beyond any clock."""
-    usable = np.abs(seconds) < _LONGEST_S
+    usable = np.abs(seconds) < LONGEST_S
     span = np.round(np.where(usable, seconds, 0.0) * 1e6).astype("timedelta64[us]")
     return np.where(usable, span, np.timedelta64("NaT", "us"))
 

@@ -338,3 +338,32 @@ def test_options_of_csv_are_refused_for_other_formats_by_name(tmp_path):
     path.write_text('<gpx><trk><trkseg><trkpt lat="48" lon="11"/></trkseg></trk></gpx>')
     with pytest.raises(ConfigError, match="crs cannot be given for gpx"):
         ingest_drive([path], tmp_path / "drives.parquet", crs="EPSG:4326")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.csv", b'time,"lat,lon\n1,48,11\n', "cannot be read as columns"),
+        ("a.csv", b'id,code,"po""sition"\n1,206,"48, 11"\n', "line of names cannot be read: .* is lost"),
+        ("a.geojson", json.dumps(
+            {"type": "FeatureCollection", "features": [line_feature({"coordTimes": STATED})]}
+        ).encode().replace(b"2024-03-21T13:05:58Z", b"2024-03\xc121"), "not UTF-8"),
+    ],
+)  # fmt: skip
+def test_damaged_files_are_refused(tmp_path, name, content, message):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_drive(path)
+
+
+def test_numbers_that_are_no_time_are_left_out(tmp_path):
+    path = tmp_path / "drive.csv"
+    path.write_text(
+        "time,lat,lon\n" + "".join(f"{t},{48 + i * 1e-4},11\n" for i, t in enumerate([0, 1, 2, "1e308", 3]))
+    )
+    layer = read_drive(path)
+    assert layer.table.num_rows == 4
+    assert layer.skipped == {"epochs without a time": 1}
+    path.write_text("week,tow,lat,lon\n" + "".join(f"{w},{i},48,11\n" for i, w in enumerate([2306, "1e308", 2306])))
+    assert read_drive(path).table["t_utc"].null_count == 0
