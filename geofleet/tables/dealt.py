@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -10,13 +10,15 @@ from geofleet.algorithms.dealing import deal, index_readers, take_rows, unpack_r
 from geofleet.tables.overlap import work_behind
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     Columns = dict[str, NDArray[Any]]
     Ints = NDArray[np.int64]
+
+Block = TypeVar("Block")
 
 NEVER_BEGUN, NEVER_ENDED = np.iinfo(np.int64).max, np.iinfo(np.int64).min  # times that are missing, µs
 _HASHES_OF_PASSES = "pass_hash.npy"
@@ -55,9 +57,9 @@ class Dealer:
         self._run_of_pass, self._folder = run_of_pass, folder
         self._dealt = np.empty(0, _ROW)
 
-    def deal_all(self, blocks: Iterable[Columns]) -> None:
-        """Deal all blocks; the next one is made while one is dealt."""
-        work_behind(self._deal, blocks)
+    def deal_all(self, blocks: Iterable[Block], coded: Callable[[Block], Columns]) -> None:
+        """Deal what a function makes of each block; the next block is read while one is made into rows and dealt."""
+        work_behind(lambda block: self._deal(coded(block)), blocks)
 
     def _deal(self, column: Columns) -> None:
         run = self._run_of_pass[column["pass_code"]]

@@ -90,8 +90,13 @@ def survey(path: Path, fine_zoom: int) -> Survey | None:
     return surveyor.found(path)
 
 
-def coded_blocks(found: Survey, passes: Mapping[Pass, int]) -> Iterator[Columns]:
-    """Yield the columns of `sql/aggregate/coded`, some rows at a time.
+def coded_columns(found: Survey) -> Iterator[pa.RecordBatch]:
+    """Read what a `Coder` needs, some rows at a time."""
+    return _blocks(found.path, ("track_id", *_PLACE, *_NUMBERS))
+
+
+class Coder:
+    """Makes the columns of `sql/aggregate/coded` of one block of `coded_columns` after the other.
 
     Parameters
     ----------
@@ -100,13 +105,19 @@ def coded_blocks(found: Survey, passes: Mapping[Pass, int]) -> Iterator[Columns]
     passes
         The number of every pass that is used; detections of others are left out.
     """
-    numbers: dict[Pass, int] = {}
-    class_codes = {name: code for code, name in enumerate(found.classes)}
-    for block in _blocks(found.path, ("track_id", *_PLACE, *_NUMBERS)):
-        of_row = _number_passes(block, numbers)
-        code = np.array([passes.get(key, -1) for key in numbers], np.int32)[of_row]
-        columns = {"pass_code": code, "class_code": _coded(block.column("sign_class"), class_codes)} | _numbers(block)
-        yield columns if (code >= 0).all() else {name: values[code >= 0] for name, values in columns.items()}
+
+    def __init__(self, found: Survey, passes: Mapping[Pass, int]) -> None:
+        self._passes = passes
+        self._numbers: dict[Pass, int] = {}
+        self._class_codes = {name: code for code, name in enumerate(found.classes)}
+
+    def __call__(self, block: pa.RecordBatch) -> Columns:
+        """Return the columns of a block."""
+        of_row = _number_passes(block, self._numbers)
+        code = np.array([self._passes.get(key, -1) for key in self._numbers], np.int32)[of_row]
+        class_code = _coded(block.column("sign_class"), self._class_codes)
+        columns = {"pass_code": code, "class_code": class_code} | _numbers(block)
+        return columns if (code >= 0).all() else {name: values[code >= 0] for name, values in columns.items()}
 
 
 def _has_own_types(schema: pa.Schema) -> bool:

@@ -14,18 +14,19 @@ from geofleet.tables.biases import BiasSummary, correct_passes
 from geofleet.tables.binding import bind_table
 from geofleet.tables.database import create_view, keep_table, make_empty, materialise, run
 from geofleet.tables.dealt import Dealer, write_pass_hashes
-from geofleet.tables.plain import BLOCK_ROWS, MAX_ID_BITS, Survey, coded_blocks, survey
+from geofleet.tables.plain import BLOCK_ROWS, MAX_ID_BITS, Coder, Survey, coded_columns, survey
 from geofleet.tables.schemas import DETECTIONS
 from geofleet.taxonomy.reader import load_taxonomy
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     import duckdb
     from numpy.typing import NDArray
 
     Columns = dict[str, NDArray[Any]]
+    Blocks = tuple[Iterable[pa.RecordBatch], Callable[[pa.RecordBatch], Columns]]  # read, and made into numbers
 
 FINE_ZOOM = 18  # cells of 100 m at 50 degrees: hot tiles are split down to these
 _CELL_M = 3_400_000.0  # a cell of zoom 0 at 85.05 degrees is at least this wide
@@ -273,20 +274,22 @@ def _deal(
     write_pass_hashes(folder, np.asarray(passes["pass_hash"], np.uint64))
     run_of_tile = np.searchsorted(run_ids, np.asarray(tiles["run_id"], str))
     dealer = Dealer(folder, readers, fine_zoom=fine_zoom, run_of_tile=run_of_tile, run_of_pass=run_of_pass)
-    dealer.deal_all(_counted(_plain_blocks(connection, plain) if plain else _blocks(connection), n_of_class))
+    blocks, coded = _plain_blocks(connection, plain) if plain else _blocks(connection)
+
+    def counted(block: pa.RecordBatch) -> Columns:
+        columns = coded(block)
+        n_of_class[:] += np.bincount(columns["class_code"], minlength=n_of_class.size)
+        return columns
+
+    dealer.deal_all(blocks, counted)
 
 
-def _counted(blocks: Iterator[Columns], n_of_class: NDArray[np.int64]) -> Iterator[Columns]:
-    for block in blocks:
-        n_of_class += np.bincount(block["class_code"], minlength=n_of_class.size)
-        yield block
-
-
-def _plain_blocks(connection: duckdb.DuckDBPyConnection, plain: Survey) -> Iterator[Columns]:
+def _plain_blocks(connection: duckdb.DuckDBPyConnection, plain: Survey) -> Blocks:
     codes = connection.sql("SELECT run_id, vehicle_id, pass_id, pass_code FROM passes").fetchall()
-    return coded_blocks(plain, {(run_id, vehicle_id, pass_id): code for run_id, vehicle_id, pass_id, code in codes})
+    passes = {(run_id, vehicle_id, pass_id): code for run_id, vehicle_id, pass_id, code in codes}
+    return coded_columns(plain), Coder(plain, passes)
 
 
-def _blocks(connection: duckdb.DuckDBPyConnection) -> Iterator[Columns]:
-    for block in run(connection, "aggregate/coded").to_arrow_reader(BLOCK_ROWS):
-        yield {name: numpy_numbers(block.column(name)) for name in block.schema.names}
+def _blocks(connection: duckdb.DuckDBPyConnection) -> Blocks:
+    blocks = run(connection, "aggregate/coded").to_arrow_reader(BLOCK_ROWS)
+    return blocks, lambda block: {name: numpy_numbers(block.column(name)) for name in block.schema.names}

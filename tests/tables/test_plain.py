@@ -68,7 +68,7 @@ def test_it_says_what_the_statements_say(tmp_path, options):
     assert 0 < coded.num_rows < 4000
     numbered = connection.sql("SELECT run_id, vehicle_id, pass_id, pass_code FROM passes").fetchall()
     passes = {tuple(key): code for *key, code in numbered}
-    blocks = list(plain.coded_blocks(found, passes))
+    blocks = list(map(plain.Coder(found, passes), plain.coded_columns(found)))
     whole = pa.table({name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]})
     assert set(whole.column_names) == set(coded.column_names)
     assert rows(whole) == rows(coded)
