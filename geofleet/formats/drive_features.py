@@ -17,6 +17,7 @@ from geofleet.formats.drive_times import guess_format, times_of
 from geofleet.formats.inventory_columns import texts
 from geofleet.formats.inventory_files import CRS84, read_features
 from geofleet.formats.positions import to_lonlat
+from geofleet.formats.reading import read_head
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,7 +25,10 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from geofleet.formats.inventory_files import Features
+
 FORMATS = ("geojson", "geojsonseq", "gpkg", "shapefile", "shapefile.zip", "flatgeobuf")
+_GEOPACKAGE, _TRACK_POINTS = b"SQLite format 3\0", "track_points"
 _POINT, _LINE, _LINES = 0, 1, 5  # shapely.get_type_id
 # Of togeojson, of its later versions, and of Mapbox
 _VERTEX_TIMES = ("coordTimes", "coordinateProperties", "times", "timestamps")
@@ -67,7 +71,7 @@ def read_epochs(path: Path) -> tuple[dict[str, Epochs], dict[str, int], dict[str
     InputError
         The file is damaged, or holds neither points nor lines.
     """
-    features = read_features(path)
+    features = _features(path)
     geometry = features.geometry
     kind = np.full(features.table.num_rows, -1) if geometry is None else shapely.get_type_id(geometry)
     is_line, is_point = np.isin(kind, (_LINE, _LINES)), kind == _POINT
@@ -91,6 +95,24 @@ def read_epochs(path: Path) -> tuple[dict[str, Epochs], dict[str, int], dict[str
     number, names = pd.factorize(vertices.drive)  # numpy takes "a\0" for "a" where it compares
     drives = {names[n]: epochs.take(placed & (number == n)) for n in dict.fromkeys(number[placed].tolist())}
     return drives, skipped, features.found | vertices.found, crs
+
+
+def _features(path: Path) -> Features:
+    """Return the rows of a file; of several layers those of the points of tracks, as GDAL makes them of GPX."""
+    import pyogrio  # noqa: PLC0415  (loads GDAL, which only these formats need)
+
+    if not read_head(path).startswith(_GEOPACKAGE):
+        return read_features(path)
+    try:
+        layers = pyogrio.list_layers(path.resolve())[:, 0].tolist()
+    except Exception:  # noqa: BLE001  (a damaged file: its reader will say so)
+        return read_features(path)
+    try:
+        return read_features(path, layer=_TRACK_POINTS if _TRACK_POINTS in layers else None)
+    except InputError as error:
+        if len(layers) > 1:
+            raise InputError(error.what, where=error.where, todo="Export the layer of the drive alone.") from None
+        raise
 
 
 def _refuse_map(path: Path, table: pa.Table, is_line: NDArray[np.bool_], is_point: NDArray[np.bool_]) -> None:

@@ -367,3 +367,16 @@ def test_numbers_that_are_no_time_are_left_out(tmp_path):
     assert layer.skipped == {"epochs without a time": 1}
     path.write_text("week,tow,lat,lon\n" + "".join(f"{w},{i},48,11\n" for i, w in enumerate([2306, "1e308", 2306])))
     assert read_drive(path).table["t_utc"].null_count == 0
+
+
+def test_of_the_layers_of_a_converted_gpx_the_points_of_its_tracks_are_the_drive(tmp_path):
+    path = tmp_path / "drive.gpkg"
+    points = gpd.GeoDataFrame({"time": TIMES}, geometry=gpd.points_from_xy(LON, LAT), crs="OGC:CRS84")
+    for layer in ("waypoints", "routes", "track_points"):
+        points.to_file(path, layer=layer)
+    assert_places(read_drive(path).table)
+    other = tmp_path / "other.gpkg"
+    for layer in ("monday", "tuesday"):
+        points.to_file(other, layer=layer)
+    with pytest.raises(InputError, match=r"2 layers: monday, tuesday\. Export the layer of the drive alone"):
+        read_drive(other)
