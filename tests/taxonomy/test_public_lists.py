@@ -5,8 +5,9 @@ Belgium: the royal order of 1 December 1975. United States: tables 2B-1, 2C-1, 2
 of 2023, figure 2B-4 of that of 2009. The Netherlands: annex 1 of the RVV 1990. Switzerland: annex 2 of the SSV.
 Austria: sections 50 to 54 of the StVO 1960, and Poland: the regulation of 31 July 2002, as OpenStreetMap lists their
 signs. Germany: the StVO as amended in 2020 and the VzKat of 2017. Finland: annex 3 of the Road Traffic Act 729/2018,
-and the decree 182/1982 that it took the place of, as the Finnish road agency lists them. OpenStreetMap: the words of
-its wiki's page on `traffic_sign`.
+and the decree 182/1982 that it took the place of, as the Finnish road agency lists them. Australia: AS 1743-2023, by
+a transcription of its drawings. Brazil: annex 2 of the CTB. OpenStreetMap: the words of its wiki's page on
+`traffic_sign`.
 """
 
 from __future__ import annotations
@@ -78,6 +79,31 @@ POLAND = {
     "D-5": "priority_over_oncoming", "D-11": "bus_lane", "D-13": "lane_arrangement", "D-14": "lane_arrangement",
     "D-44": "parking_zone", "D-46": "internal_road", "D-47": "end_internal_road", "D-52": "traffic_zone",
     "D-53": "end_traffic_zone", "D-54": "environmental_zone", "D-55": "end_environmental_zone",
+}  # fmt: skip
+AUSTRALIA = {
+    "R1-1": "stop", "R1-3": "roundabout", "R2-2(L)": "one_way", "R2-3": "keep_left", "R2-3(R)": "keep_right",
+    "R2-6(L)": "no_left_turn", "R2-7": "straight_only", "R2-9(L)": "lane_use", "R2-11": "two_way_traffic",
+    "R2-14(R)": "turn_right_ahead", "R4-4": "living_street", "R4-5": "end_living_street", "R4-8": "speed_zone",
+    "R4-9": "end_speed_zone", "R4-12": "end_speed_limit", "R4-13": "end_speed_zone", "R5-2/2": "parking",
+    "R5-16": "parking", "R5-23": "loading_place", "R5-35": "no_stopping", "R5-40": "no_parking", "R5-50": "no_stopping",
+    "R5-61": "parking_zone", "R5-63": "end_parking_zone", "R5-80": "no_parking_zone", "R5-83": "end_no_parking_zone",
+    "R5-85(L)": "emergency_bay", "R6-1": "no_overtaking", "R6-3": "weight_limit", "R6-10-3": "no_bicycles",
+    "R6-11": "height_limit", "R6-13": "no_pedestrians_bicycles", "R6-15": "no_pedestrians", "R6-19": "motorway",
+    "R6-21": "end_motorway", "R6-25": "level_crossing_cross", "R6-33": "length_limit", "R7-1-1": "bus_lane",
+    "R7-1-4": "cycle_lane", "R7-4": "plate_other", "R7-7-1": "preferential_lane", "R8-2": "shared_path",
+    "R9-1-1": "plate_time", "R9-4": "plate_except", "W1-7(L)": "curve_left", "W1-2": "double_curve",
+    "W2-8": "side_road", "W3-3-1": "warn_traffic_signals", "W3-4-1": "bump", "W4-3": "road_narrows",
+    "W4-4": "divided_road", "W4-8": "height_limit", "W4-11": "two_way_traffic", "W5-6": "floodway",
+    "W5-19": "pavement_ends", "W5-34(L)": "lanes_merge", "W5-41": "warn_tram", "W6-2": "warn_pedestrian_crossing",
+    "W7-8": "level_crossing_approach", "W7-15": "level_crossing_gated", "W8-2": "plate_advisory_speed",
+    "W8-5": "plate_distance", "W8-7": "plate_other",
+}  # fmt: skip
+BRAZIL = {
+    "A-1a": "curve_left", "A-4b": "double_curve_right", "A-20a": "steep_descent", "A-21b": "road_narrows_left",
+    "A-26b": "two_way_traffic", "A-32a": "warn_pedestrians", "A-39": "level_crossing_open", "A-42c": "divided_road",
+    "A-46": "weight_limit", "A-47": "axle_load_limit", "A-48": "length_limit", "R-15": "height_limit",
+    "R-16": "width_limit", "R-24a": "one_way", "R-36a": "segregated_path_cycle_left",
+    "R-36b": "segregated_path_cycle_right", "R-46": "shared_path",
 }  # fmt: skip
 GERMANY = {
     "277": "no_overtaking_trucks", "277.1": "no_overtaking_two_wheelers", "281.1": "end_no_overtaking_two_wheelers",
@@ -287,6 +313,8 @@ CASES = [
         ("mutcd", "US", UNITED_STATES),
         ("stvo-at", "AT", AUSTRIA),
         ("pl", "PL", POLAND),
+        ("as1742", "AU", AUSTRALIA),
+        ("contran", "BR", BRAZIL),
         ("stvo", "DE", GERMANY),
         ("rvv", "NL", NETHERLANDS),
         ("ssv", "CH", SWITZERLAND),
@@ -317,6 +345,8 @@ def test_a_code_means_what_the_list_says(scheme, country, code, concept):
         ("pl", "D-20"),
         ("pl", "D-51b"),
         ("pl", "A-T-1"),
+        ("as1742", "R5-51"),
+        ("as1742", "R6-8"),
     ],
 )
 def test_what_is_no_such_sign_is_not_known(scheme, code):
