@@ -98,7 +98,7 @@ class Block:
         """Tell whether the block holds nodes, without decoding them."""
         return any(next(fields(self.data, group), (0, 0))[0] in {1, 2} for group in self._parts[1])
 
-    def ways(self, is_wanted: Callable[[bytes], bool]) -> Iterator[tuple[int, bytes, bytes, bytes]]:
+    def ways(self, is_wanted: Callable[[bytes], object]) -> Iterator[tuple[int, bytes, bytes, bytes]]:
         """Yield id, packed keys, packed values and packed references of the ways whose packed keys are wanted."""
         for group in self._parts[1]:
             for number, value in fields(self.data, group):

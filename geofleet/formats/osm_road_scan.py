@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ import numpy as np
 from geofleet.formats.osm_dense import DenseNodes
 from geofleet.formats.osm_pbf import Block, read_blocks
 from geofleet.formats.osm_roads import Roads
-from geofleet.formats.osm_tags import CAR_ROADS, ROAD_KEYS, is_drivable, oneway_of, speed_kmh
+from geofleet.formats.osm_tags import CAR_ROADS, ROAD_KEYS, is_drivable, is_sign_key, oneway_of, speed_kmh
 from geofleet.formats.protobuf import varints_of
 
 if TYPE_CHECKING:
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
 _E7 = 1e7
 _MAX_E7 = (1_800_000_000, 900_000_000)
 _NOWHERE = np.iinfo(np.int32).max
-_HIGHWAY = b"\n\x07highway"
+_NO_STRING = -1
+_HIGHWAY, _SIGN = b"\n\x07highway", b"traffic_sign"
 _CAR_ROADS, _ROAD_KEYS = ([word.encode() for word in words] for words in (CAR_ROADS, ROAD_KEYS))
 
 
@@ -63,6 +65,7 @@ def read_roads(pbf: Path) -> Roads:
         lon=points[:, 0],
         lat=points[:, 1],
         n_missing_nodes=int((~is_there).sum()),
+        n_signed_ways=int(ways.n_signed.sum()),
     )
 
 
@@ -80,7 +83,7 @@ def _runs(position: Ints, way_of: Ints) -> tuple[NDArray[np.bool_], Ints, Ints]:
 
 @dataclass(frozen=True, slots=True)
 class _Ways:
-    """Drivable ways, shape (n,), and the ids of their nodes, one way after the other."""
+    """Drivable ways, shape (n,), the ids of their nodes, one way after the other, and of each block the signed ways."""
 
     way_id: Ints
     n_refs: Ints
@@ -88,29 +91,31 @@ class _Ways:
     kind: NDArray[np.object_]
     oneway: NDArray[np.int8]
     speed_limit_kmh: NDArray[np.float64]
+    n_signed: Ints
 
     @classmethod
     def joined(cls, parts: list[_Ways]) -> _Ways:
-        kinds = (np.int64, np.int64, np.int64, object, np.int8, np.float64)
+        kinds = (np.int64, np.int64, np.int64, object, np.int8, np.float64, np.int64)
         columns = [[getattr(part, name) for part in parts] for name in cls.__slots__]
         return cls(*(np.concatenate([np.zeros(0, k), *c]) for k, c in zip(kinds, columns, strict=True)))
 
 
 def _ways_in(block: Block) -> _Ways | None:
     """Return the drivable ways of a block."""
-    if not block.holds_string(_HIGHWAY):
+    if not (block.holds_string(_HIGHWAY) or block.holds_string(_SIGN)):
         return None
     strings = block.strings
-    highway = next(iter(strings.numbers([b"highway"])), None)
-    if highway is None:
+    highway = next(iter(strings.numbers([b"highway"])), _NO_STRING)
+    signs = [n for n in strings.starting([_SIGN]) if is_sign_key(strings[n].decode(errors="replace"))]
+    marks = [re.escape(_encoded(number)) for number in (highway, *signs) if number != _NO_STRING]
+    if not marks:
         return None
-    mark = _encoded(highway)
-    ways = list(block.ways(lambda packed: mark in packed))
+    ways = list(block.ways(re.compile(b"|".join(marks)).search))
     keys, start = varints_of([way[1] for way in ways])
     values, values_start = varints_of([way[2] for way in ways])
     if not np.array_equal(start, values_start):
         raise ValueError("keys and values of a way differ in number")
-    roads = np.unique(np.searchsorted(start, _roads_at(strings, highway, keys, values), "right") - 1)
+    roads = _ways_at(_is_road(strings, highway, keys, values), start)
     drivable = {n: tags for n, tags in _tags(strings, keys, values, start, roads) if is_drivable(tags)}
     coded, begins = varints_of([ways[n][3] for n in drivable])
     speeds = [speed_kmh(tags.get("maxspeed")) for tags in drivable.values()]
@@ -121,15 +126,20 @@ def _ways_in(block: Block) -> _Ways | None:
         kind=np.array([tags["highway"] for tags in drivable.values()], object),
         oneway=np.array([oneway_of(tags) for tags in drivable.values()], np.int8),
         speed_limit_kmh=np.array([np.nan if speed is None else speed for speed in speeds], np.float64),
+        n_signed=np.array([len(_ways_at(np.isin(keys, signs), start))]),
     )
 
 
-def _roads_at(strings: Strings, highway: int, keys: Ints, values: Ints) -> Ints:
-    """Return the places of tags that make a way a road for cars."""
+def _ways_at(is_told: NDArray[np.bool_], start: Ints) -> Ints:
+    """Return the ways that have one of some tags."""
+    return np.asarray(np.unique(np.searchsorted(start, np.flatnonzero(is_told), "right") - 1), np.int64)
+
+
+def _is_road(strings: Strings, highway: int, keys: Ints, values: Ints) -> NDArray[np.bool_]:
+    """Tell which tags make a way a road for cars."""
     is_road = np.zeros(len(strings), bool)
     is_road[strings.numbers(_CAR_ROADS)] = True
-    at = np.flatnonzero(keys == highway)
-    return at[is_road[values[at]]]
+    return np.asarray((keys == highway) & is_road[values], bool)
 
 
 def _tags(strings: Strings, keys: Ints, values: Ints, start: Ints, ways: Ints) -> Iterator[tuple[int, dict[str, str]]]:

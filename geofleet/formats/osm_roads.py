@@ -51,6 +51,8 @@ class Roads:
         Points, degrees, shape (p,).
     n_missing_nodes
         Nodes that ways refer to and the file does not hold.
+    n_signed_ways
+        Ways of any kind with a key of signs.
     """
 
     way_id: Ints
@@ -62,6 +64,7 @@ class Roads:
     lon: Floats
     lat: Floats
     n_missing_nodes: int
+    n_signed_ways: int = 0
 
     def lines(self) -> NDArray[np.object_]:
         """Return one line string a run, in degrees."""

@@ -43,6 +43,7 @@ TWICE = f"highway=stop, give_way within {_MAPPED_TWICE_M:.0f} m of the sign itse
 UNKNOWN, STATED = "unknown codes", "facings in the tags"
 INFERRED, NO_ROAD = "facings from the road", "signs without a road nearby"
 EDGE = "way nodes beyond the edge of the file"
+SIGNED_WAYS = "ways tagged with signs, which say what holds there and not where a sign stands"
 _HYPHEN, _NOTHING = arrow_texts(["-", ""])
 
 
@@ -129,6 +130,8 @@ class SignRows:
             from geofleet.formats.osm_roads import RoadIndex  # noqa: PLC0415  (not needed without roads)
 
             self.found.update({INFERRED: 0, NO_ROAD: 0, EDGE: self._roads.n_missing_nodes})
+            if self._roads.n_signed_ways:
+                self.skipped[SIGNED_WAYS] = self._roads.n_signed_ways
             index = RoadIndex(self._roads)
         twice = _mapped_twice(self._nodes.spool, self._tags)
         check = PlaceCheck(str(self._path))

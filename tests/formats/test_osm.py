@@ -173,6 +173,19 @@ def test_a_map_without_signs_gives_an_empty_layer(tmp_path):
     assert read_lanes(path).table.num_rows == 0
 
 
+def test_ways_tagged_with_signs_are_counted_and_no_signs(tmp_path):
+    corners = [node(n, 11.5 + n * 1e-3, 48.1) for n in (1, 2, 3)]
+    ways = [
+        way(1, (1, 2), highway="residential", traffic_sign="DE:274.1"),
+        way(2, (2, 3), highway="footway", **{"traffic_sign:forward": "DE:239", "traffic_sign": "DE:239"}),
+        way(3, (1, 3), landuse="grass", traffic_sign="city_limit"),
+        way(4, (1, 3), highway="residential", traffic_signals="no", **{"traffic_sign:note": "none"}),
+    ]
+    layer = read_signs(xml(tmp_path, "".join(corners + ways)))
+    assert layer.table.num_rows == 0
+    assert layer.skipped == {"ways tagged with signs, which say what holds there and not where a sign stands": 3}
+
+
 def test_ids_may_be_negative_or_long_and_positions_missing(tmp_path):
     body = node(-12, 10.0, 50.0, traffic_sign="DE:206") + node(9_000_000_000_000_000_000, 10.0, 50.0, highway="stop")
     body += '<node id="3"><tag k="traffic_sign" v="DE:206"/></node>'
