@@ -97,19 +97,21 @@ def test_tiles_workers_batches_and_row_order_do_not_show(tmp_path, monkeypatch, 
     st.sampled_from(sorted(PLACES)),
     st.sampled_from(["first", "after"]),
     st.tuples(st.integers(12, 20), st.integers(20, 3000), st.integers(1, 4)),
+    st.integers(3, 8),
 )
-def test_tiles_do_not_show_where_dense_places_ask_for_more(seed, place, semantic, how):
+def test_tiles_do_not_show_where_dense_places_ask_for_more(seed, place, semantic, how, min_samples):
     """Signs of a hundred detections, chained by a core of three; clusters across tiles are split as all others are."""
     zoom, batch_rows, n_workers = how
+    rule = {"semantic": semantic, "min_samples": min_samples, "min_samples_share": 0.7}
     table = scene(seed=seed, frame=PLACES[place], n_signs=30, n_seen=100, reach_m=60, sigma_m=1.8)
     with TemporaryDirectory() as name, pytest.MonkeyPatch.context() as patch:
-        whole = run_on(Path(name), table, semantic=semantic, tile_zoom=12)
-        plain = run_on(Path(name), table, name="plain", semantic=semantic, tile_zoom=12, min_samples_share=0.0)
+        whole = run_on(Path(name), table, **rule, tile_zoom=12)
+        plain = run_on(Path(name), table, name="plain", **rule | {"min_samples_share": 0.0}, tile_zoom=12)
         assert plain.out.read_bytes() != whole.out.read_bytes()
         patch.setattr(tiles, "COARSER_BY", 0)
         patch.setattr(tiles, "BATCH_ROWS", batch_rows)
         mixed = table.take(np.random.default_rng(seed).permutation(table.num_rows))
-        parts = run_on(Path(name), mixed, name="parts", tile_zoom=zoom, n_workers=n_workers, semantic=semantic)
+        parts = run_on(Path(name), mixed, name="parts", **rule, tile_zoom=zoom, n_workers=n_workers)
         assert parts.out.read_bytes() == whole.out.read_bytes()
 
 
