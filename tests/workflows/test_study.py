@@ -28,7 +28,7 @@ from geofleet.tables.store import read_table
 from geofleet.workflows.study import units
 from geofleet.workflows.study.compare import compare
 from geofleet.workflows.study.fleet_size import fleet_size
-from geofleet.workflows.study.methods import METHODS, parse_methods
+from geofleet.workflows.study.methods import METHODS, parse_methods, with_settings
 from geofleet.workflows.study.paper import paper_curve, paper_points, paper_table
 from geofleet.workflows.study.results import totals
 from geofleet.workflows.study.units import Unit, map_fleets, run_study, simulate_fleets, world_batch
@@ -278,6 +278,7 @@ def test_a_fleet_alone_has_the_detections_it_has_among_others(inputs, tmp_path):
     batch = replace(world_batch(study, study.worlds[0]), units=units)
     fleets = simulate_fleets(batch, tmp_path)
     together = map_fleets(batch, fleets, study.methods[0], 3)
+    config = with_settings(study.worlds[0].config, study.methods[0])
     for number in (1, 2):
-        aggregate(fleets.of(number), tmp_path / "alone.parquet", config=study.worlds[0].config, n_vehicles=3)
+        aggregate(fleets.of(number), tmp_path / "alone.parquet", config=config, n_vehicles=3)
         assert read_table(SIGNS, tmp_path / "alone.parquet").equals(together[number])
