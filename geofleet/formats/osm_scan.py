@@ -218,7 +218,8 @@ def _int32(e7: Ints) -> NDArray[np.int32]:
 
 def _signs_in(blocks: list[Block]) -> _Found | None:
     """Return the sign nodes of some blocks; None when they hold no nodes at all."""
-    if not any(block.has_nodes() for block in blocks):
+    blocks = [block for block in blocks if block.has_nodes()]
+    if not blocks:
         return None
     nodes = DenseNodes([block for block in blocks if any(map(block.holds_string, _MARKS))], tagged=True)
     chosen, n_tags, tags = _sign_tags(nodes)

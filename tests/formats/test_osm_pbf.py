@@ -203,6 +203,12 @@ def test_blocks_decoded_together_give_what_each_gives_alone(tmp_path, monkeypatc
     assert together.tagsets[-1] == {"traffic_sign": ""}
 
 
+def test_a_key_that_stands_twice_in_its_table_is_read_by_either_number(tmp_path):
+    strings = [b"", b"highway", b"stop", b"highway"]
+    path = pbf(tmp_path / "a.pbf", block(strings, dense([(1, 0, 0, [1, 2]), (2, 0, 0, [3, 2]), (3, 0, 0, [2, 3])])))
+    assert all_of(sign_nodes(path))["node_id"].tolist() == [1, 2]
+
+
 def plain_nodes(*nodes):
     return b"".join(
         field(
