@@ -263,7 +263,7 @@ def run_task(name: str, path: Path, work: Path, *, again: bool) -> dict[str, Any
     """Run a task here, and perhaps once more; CPU time and peak memory are those of the first call and the imports."""
     result = TASKS[name](path, work)
     usage = resource.getrusage(resource.RUSAGE_SELF)
-    result |= {"cpu_s": usage.ru_utime + usage.ru_stime, "peak_mb": usage.ru_maxrss / 1024}
+    result |= {"cpu_s": usage.ru_utime + usage.ru_stime, "peak_mb": peak_mb()}
     if again:
         begin = time.process_time()
         second = TASKS[name](path, work / "again")
@@ -278,6 +278,12 @@ def compile_first(folder: Path) -> None:
     work.mkdir()
     seconds = sum(measure(name, path, work, again=False)["cpu_s"] for name in ("geofleet", "geofleet-kernel"))
     print(f"compiled before anything is timed, once per installation: {seconds:.0f} s of CPU with imports")
+
+
+def peak_mb() -> float:
+    """Return the most memory that this process has held; `ru_maxrss` also knows what its parent held before it."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return int(status.partition("VmHWM:")[2].split()[0]) / 1024
 
 
 def compare(scene: str, size: int, only: list[str], folder: Path, *, again: bool) -> dict[str, dict[str, Any]]:
