@@ -177,22 +177,23 @@ def load_taxonomy() -> Taxonomy:
 
 @lru_cache(maxsize=65536)
 def _meaning(code: str, country: str, scheme: str) -> Meaning:
-    texts, land = _normalised(code.strip(), country.upper(), scheme)
+    code = code.strip()
+    texts, land = _normalised(code, country.upper(), scheme)
     candidates = {_without_bracket(text): text for text in reversed(texts)} | {text: text for text in texts}
     for rule in _rules_for(land, scheme).that_may_match(tuple(candidates)):
         for candidate, text in candidates.items():
             match = rule.pattern.fullmatch(candidate)
             if match:
                 return _understood(rule, match, text)
-    named = _NAMED.fullmatch(code.strip()) if scheme in {"", "lanelet2"} else None
+    named = _NAMED.fullmatch(code) if scheme in {"", "lanelet2"} else None
     if named and named[1].upper() != country.upper():
         theirs = _meaning(named[2], named[1], "")
         if theirs.known:
             return theirs
-    own = _own_class(code.strip()) if not scheme else None
+    own = _own_class(code) if not scheme else None
     if own:
         return own
-    raw = RAW_PREFIX + code.strip()
+    raw = RAW_PREFIX + code.removeprefix(RAW_PREFIX)  # which an earlier reading has put there
     return Meaning(raw, OTHER_GROUP, _kind_of_raw(raw), None, None, raw, known=False)
 
 

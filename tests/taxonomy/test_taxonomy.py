@@ -143,6 +143,11 @@ def test_codes_of_schemes(code, scheme, sign_class):
     assert TAXONOMY.classify([code], scheme=scheme).sign_class.tolist() == [sign_class]
 
 
+def test_a_raw_class_read_again_is_the_same_class():
+    assert TAXONOMY.meaning("raw:077[7]").sign_class == "raw:077[7]"
+    assert TAXONOMY.meaning("raw:").sign_class == "raw:"
+
+
 def test_an_unknown_code_keeps_its_text_and_is_a_class_of_its_own():
     found = TAXONOMY.classify(["077[7]", "206"], country=["FI", "DE"])
     assert found.sign_class.tolist() == ["raw:077[7]", "stop"]
