@@ -16,7 +16,7 @@ import shapely
 from geofleet.errors import InputError
 from geofleet.formats.inventory_files import CRS84, detect, read_features
 from geofleet.formats.reading import read_head, refuse_long_lines
-from geofleet.formats.text_tables import encoding_of, read_header
+from geofleet.formats.text_tables import ANSI, NOT_UTF8, encoding_of, read_header
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -47,6 +47,8 @@ class Batch:
         Number of the first row, counted from 1 in the file.
     broken
         Number and text of lines that have more or fewer fields than the header.
+    notes
+        What is to be told of the file.
     """
 
     table: pa.Table
@@ -54,6 +56,7 @@ class Batch:
     crs: Any
     first_row: int
     broken: tuple[tuple[int, str], ...] = field(default=())
+    notes: tuple[str, ...] = field(default=())
 
 
 def read_batches(path: Path) -> Iterator[Batch]:
@@ -83,7 +86,7 @@ def _csv_batches(path: Path) -> Iterator[Batch]:
     from pyarrow import csv as arrow_csv  # noqa: PLC0415  (only CSV needs it)
 
     refuse_long_lines(path)
-    encoding = encoding_of(path, max_bytes=_SAMPLE_BYTES)
+    encoding = encoding_of(path)  # of all of it: PyArrow cannot say what is wrong with a line that it cannot decode
     header = read_header(path, encoding)
     if _is_one_line(path):
         return
@@ -103,12 +106,13 @@ def _csv_batches(path: Path) -> Iterator[Batch]:
         convert_options=arrow_csv.ConvertOptions(column_types=dict.fromkeys(header.names, pa.string())),
     )
     first = 1
+    notes = (NOT_UTF8,) if encoding == ANSI else ()
     for block in reader:
         lost, broken[:] = tuple(broken), []
-        yield Batch(pa.Table.from_batches([block]), None, None, first, lost)
+        yield Batch(pa.Table.from_batches([block]), None, None, first, lost, notes)
         first += block.num_rows + len(lost)
     if broken:
-        yield Batch(reader.schema.empty_table(), None, None, first, tuple(broken))
+        yield Batch(reader.schema.empty_table(), None, None, first, tuple(broken), notes)
 
 
 def _parquet_batches(path: Path) -> Iterator[Batch]:

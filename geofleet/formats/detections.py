@@ -136,6 +136,7 @@ def read_detections(
                 batch.table.column_names, named, has_geometry=batch.geometry is not None and "x" not in named
             )
             _require(chosen, batch, path)
+            found.update(dict.fromkeys(batch.notes, 1))
             found.update({f"{thing} read from column {chosen[thing]} (guessed)": 1 for thing in guessed})
             plan = _Plan(chosen, crs or batch.crs or _CRS84, scheme or "", country, run_id, rows_before)
             plan = _settled(plan, batch, path, found)

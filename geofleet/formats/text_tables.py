@@ -34,19 +34,15 @@ class Header:
     n_before: int
 
 
-def encoding_of(path: Path, *, max_bytes: int | None = None) -> str:
-    """Return the encoding of a text: by its byte order mark, else UTF-8 when it is, else Windows-1252.
-
-    `max_bytes` bounds how much of the file is looked at; all of it by default.
-    """
+def encoding_of(path: Path) -> str:
+    """Return the encoding of a text: by its byte order mark, else UTF-8 when all of it is, else Windows-1252."""
     if read_head(path).startswith(_UTF16_MARKS):
         return "utf-16"
     decoder = codecs.getincrementaldecoder("utf-8")()
     try:
-        for chunk in _chunks(path, max_bytes):
+        for chunk in _chunks(path):
             decoder.decode(chunk)
-        if max_bytes is None:
-            decoder.decode(b"", final=True)
+        decoder.decode(b"", final=True)
     except UnicodeDecodeError:
         return ANSI
     return "utf-8"
@@ -115,10 +111,7 @@ def is_header(names: list[str]) -> bool:
     return len(names) > 1 and all(len(n) <= _MAX_NAME_LETTERS and len(n.split()) <= _MAX_NAME_WORDS for n in names)
 
 
-def _chunks(path: Path, max_bytes: int | None) -> Iterator[bytes]:
+def _chunks(path: Path) -> Iterator[bytes]:
     with path.open("rb") as file:
-        if max_bytes is not None:
-            yield file.read(max_bytes)
-            return
         while chunk := file.read(_CHUNK_BYTES):
             yield chunk

@@ -106,6 +106,17 @@ def test_parquet_with_numbers_dictionaries_times_and_wkb(tmp_path):
     assert read.skipped == {"position missing or no number": 1}
 
 
+def test_letters_of_windows_far_down_are_read_and_told_and_broken_lines_kept(tmp_path):
+    row = b"8.8,53.1,stop,a\n"
+    path = tmp_path / "fleet.csv"
+    path.write_bytes(b"lon,lat,sign_class,vehicle_id\n" + row * 80_000 + b"8.8,53.1,stop,M\xfcller,too,many\n" + row)
+    read = list(read_detections(path))
+    assert sum(part.table.num_rows for part in read) == 80_001
+    (rejected,) = [line for part in read for line in part.rejected["content"].to_pylist()]
+    assert rejected == "8.8,53.1,stop,M\u00fcller,too,many"
+    assert read[0].found["read as Windows-1252, since it is not UTF-8"] == 1
+
+
 def test_options_from_a_toml_file(tmp_path):
     toml = csv_file(tmp_path, 'crs = "EPSG:4326"\nscheme = "osm"\n[columns]\nx = "a"\ny = "b"\ncode = "c"\n', "m.toml")
     read = one(csv_file(tmp_path, "a,b,c\n8,53,stop\n"), columns=toml)
