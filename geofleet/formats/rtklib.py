@@ -172,7 +172,7 @@ def _refuse_unheaded_baseline(epochs: Epochs, path: Path) -> None:
 def _places(frame: pd.DataFrame, header: _Header) -> tuple[_Places, Flags]:
     """Return the places of all lines, and which of them could be read."""
     first = [_numbers(frame, _N_TIME + i) for i in range(3)]
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         radius = np.sqrt(first[0] ** 2 + first[1] ** 2 + first[2] ** 2)
     readable = np.asarray(np.isfinite(radius))
     if header.is_ecef or (readable.any() and float(np.median(radius[readable])) > LEAST_RADIUS_M):

@@ -63,6 +63,13 @@ def test_two_headers_of_one_drive_give_one_time(shared_data):
     assert by_week == by_date == datetime(2023, 7, 11, 6, 4, 12, tzinfo=UTC)  # 06:04:30 GPST
 
 
+def test_a_height_whose_square_is_no_number_warns_nobody(tmp_path):
+    times = [f"2024/05/01 10:00:0{i}.000" for i in range(4)]
+    lines = rows(times).splitlines(keepends=True)
+    lines[2] = lines[2].replace("  100.0 ", "  1e308 ", 1)
+    assert read_drive(pos(tmp_path, TITLE.format("GPST") + "".join(lines))).table.num_rows == 4
+
+
 def test_the_length_of_a_real_drive(shared_data):
     layer = read_drive(shared_data / "trajectory" / "nagoya" / "reference_1Hz.pos")
     lon, lat = lonlat(layer.table)
