@@ -24,6 +24,7 @@ _SECONDS_A_LINE = 15
 _FAR = " (over 100 m: --clip leaves them out)"
 _HINTS = {"map_signs_far_from_reference": _FAR, "reference_signs_far_from_map": _FAR}
 _PATIENCE_S = 2.0
+_SCORES = "f1", "gospa_m"  # whose intervals are printed
 
 
 @contextmanager
@@ -170,14 +171,15 @@ def print_evaluation(result: EvaluateResult) -> None:
 def _print_intervals(rows: tuple[dict[str, Any], ...]) -> None:
     """Say how sure F1 and GOSPA_M are, and of what; all scores stand in intervals.csv."""
     for row in rows:
-        if row["score"] in ("f1", "gospa_m") and row["low"] is not None:
+        if row["score"] in _SCORES and row["low"] is not None:
             typer.echo(
                 f"{row['score']} {row['estimate']:.4f}, {row['level']:.0%} interval "
                 f"{row['low']:.4f} to {row['high']:.4f}: {row['estimand']}"
             )
-        elif row["score"] in ("f1", "gospa_m"):
+        elif row["score"] in _SCORES:
             typer.echo(f"{row['score']}: no interval: {row['note']}")
-    notes = (note for row in rows if row["note"] and row["low"] is not None for note in row["note"].split("; "))
+    told = (row["note"] for row in rows if row["score"] in _SCORES and row["note"] and row["low"] is not None)
+    notes = (note for one in told for note in one.split("; "))
     for note in dict.fromkeys(notes):
         typer.echo(f"  beware: {note}")
 

@@ -111,7 +111,7 @@ def read_epochs(
             todo="Look at the quotes in it.",
         )
     x, y, made_of = _coordinates(frame, layout, local)
-    has_heights = not any(what.startswith(SCALED[:20]) for what in made_of)  # they may be in any unit then
+    has_heights = set(made_of).isdisjoint(SCALED.values())  # they may be in any unit then
     z = _numbers(frame, layout.columns.get("height") if has_heights else None)
     lon, lat, height_m = to_places(x, y, z, local, where=str(path))
     t_utc, elapsed_s, told = _times(frame, layout, lon, lat)

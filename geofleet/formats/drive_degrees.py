@@ -28,7 +28,10 @@ _MAX_LON_DEG, _MAX_LAT_DEG, _MINUTES = 180.0, 90.0, 60.0
 _E7, _LEAST_E7 = 1e-7, 1e5
 _HALF_CIRCLE = 1 << 31
 MINUTES = "positions read as degrees and minutes, ddmm.mmmm (guessed)"
-SCALED = "positions read as whole numbers of {} (guessed), heights not taken"
+SCALED = {
+    unit: f"positions read as whole numbers of {unit} (guessed), heights not taken"
+    for unit in ("1e-7 degrees", "semicircles")
+}
 
 
 def degrees_of(frame: pd.DataFrame, columns: Mapping[str, str]) -> tuple[Floats, Floats, list[str]]:
@@ -48,7 +51,7 @@ def degrees_of(frame: pd.DataFrame, columns: Mapping[str, str]) -> tuple[Floats,
     told = []
     scale = _scale(x, y, columns["y"])
     if scale != 1.0:
-        told.append(SCALED.format("1e-7 degrees" if scale == _E7 else "semicircles"))
+        told.append(SCALED["1e-7 degrees" if scale == _E7 else "semicircles"])
         x, y = x * scale, y * scale
     elif _is_minutes(x, y, frame, columns):
         told.append(MINUTES)
